@@ -1,0 +1,23 @@
+"""State an estimation problem once, in symbols; solve it as a QP, a nonlinear program or a factor graph."""
+
+from problems.errors import HorizonetError
+from problems.noise import L2, Cauchy, Gaussian, GemanMcClure, Huber, Tukey
+from problems.problem import Problem
+from problems.spaces import SE2, SO2, Pose2, Rotation2, Vector, wrap
+
+__all__ = [
+    "L2",
+    "SE2",
+    "SO2",
+    "Cauchy",
+    "Gaussian",
+    "GemanMcClure",
+    "HorizonetError",
+    "Huber",
+    "Pose2",
+    "Problem",
+    "Rotation2",
+    "Tukey",
+    "Vector",
+    "wrap",
+]

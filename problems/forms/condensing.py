@@ -1,0 +1,108 @@
+"""Eliminating unknowns through equalities: ``z = Z v + Y d + z0``.
+
+`eliminate` solves chosen unknowns from the equalities that define them (condensed windows); `null_space` removes all
+equalities at once. Both give the same kind of map, so whatever is expressed in z can be expressed in v.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from problems.errors import EmptyConstraintError, FormError
+
+Matrix = Any
+
+
+@dataclass(eq=False)
+class AffineMap:
+    """All unknowns as an affine function of fewer: ``z = Z v + Y d + z0``."""
+
+    Z: Matrix
+    Y: Matrix
+    z0: np.ndarray
+
+    @classmethod
+    def identity(cls, size: int, data: int, dense: bool) -> AffineMap:
+        if dense:
+            return cls(np.eye(size), np.zeros((size, data)), np.zeros(size))
+        return cls(sp.eye_array(size, format="csr"), sp.csr_array((size, data)), np.zeros(size))
+
+    def then(self, inner: AffineMap) -> AffineMap:
+        """This map with its v given by `inner`."""
+        return AffineMap(self.Z @ inner.Z, self.Y + self.Z @ inner.Y, self.z0 + self.Z @ inner.z0)
+
+
+def defining_rows(R: Matrix, columns: np.ndarray) -> np.ndarray:
+    """Rows that contain any of `columns`."""
+    part = abs(R[:, columns])
+    return np.flatnonzero(np.asarray(part.sum(axis=1)).ravel() > 0)
+
+
+def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: str) -> tuple[AffineMap, np.ndarray]:
+    """Solve the unknowns in `columns` from the equalities ``R z + E d + c = 0`` that contain them.
+
+    Returns:
+        The map, whose v are the other unknowns in their order, and the rows that were used up.
+
+    Raises:
+        FormError: the equalities containing them are not square in them, or singular.
+    """
+    used = defining_rows(R, columns)
+    size = R.shape[1]
+    kept = np.setdiff1d(np.arange(size), columns)
+    if used.size != columns.size:
+        raise FormError(
+            f"cannot eliminate {names}: {columns.size} unknowns appear in {used.size} equality rows; the equalities "
+            "must define them one to one"
+        )
+    dense = isinstance(R, np.ndarray)
+    block = R[used][:, columns]
+    right = [R[used][:, kept], E[used], c[used][:, None]]
+    if dense:
+        if np.linalg.cond(block) > 1e12:
+            raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)")
+        solved = [-np.linalg.solve(block, b) for b in right]
+        Z, Y = np.zeros((size, kept.size)), np.zeros((size, E.shape[1]))
+        Z[kept, np.arange(kept.size)] = 1.0
+        Z[columns], Y[columns] = solved[0], solved[1]
+    else:
+        try:
+            factor = spla.splu(sp.csc_matrix(block))
+        except RuntimeError as error:
+            raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)") from error
+        solved = [-factor.solve(b.toarray() if sp.issparse(b) else b) for b in right]
+        place = sp.csr_array(
+            (np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size)
+        )
+        stay = sp.csr_array((np.ones(kept.size), (kept, np.arange(kept.size))), shape=(size, kept.size))
+        Z = (stay + place @ sp.csr_array(solved[0])).tocsr()
+        Y = (place @ sp.csr_array(solved[1])).tocsr()
+    z0 = np.zeros(size)
+    z0[columns] = np.asarray(solved[2]).ravel()
+    return AffineMap(Z, Y, z0), used
+
+
+def null_space(R: np.ndarray, E: np.ndarray, c: np.ndarray) -> AffineMap:
+    """Coordinates v on the solutions of ``R z + E d + c = 0`` (dense; orthonormal Z, least-norm particular part).
+
+    Raises:
+        EmptyConstraintError: the rows contradict each other whatever the data are.
+    """
+    size = R.shape[1]
+    if not R.shape[0]:
+        return AffineMap.identity(size, E.shape[1], True)
+    U, s, Vt = la.svd(R)
+    rank = int((s > 1e-11 * max(s[0], 1.0)).sum())
+    null = U[:, rank:]
+    if rank < R.shape[0] and np.abs(null.T @ np.column_stack([E, c])).max() > 1e-9:
+        if np.abs(null.T @ E).max() <= 1e-9:
+            raise EmptyConstraintError("the equalities contradict each other; no point satisfies all of them")
+        raise FormError("some equality rows are combinations of others, so they restrict the data; remove them")
+    inverse = Vt[:rank].T @ (U[:, :rank] / s[:rank]).T
+    return AffineMap(Vt[rank:].T.copy(), -inverse @ E, -inverse @ c)

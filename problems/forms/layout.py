@@ -1,0 +1,298 @@
+"""Where everything of a problem stands in flat arrays, and the sticky data of a session.
+
+A point is one array of stored coordinates, a step one array of tangent coordinates, all data one array of numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from problems.errors import DataError, EmptyConstraintError, ShapeError, UnknownNameError
+from problems.problem import Data, DataSlot, Problem, Slot, Term
+from problems.spaces import points
+
+INFINITE = 1e20  # stands for an infinite bound given as data, where 0 * inf must not become NaN
+
+
+def data_rows(entry: Data, value: Any) -> np.ndarray:
+    """`value` as (rows, size) numbers of `entry`; one row is repeated.
+
+    Raises:
+        ShapeError: it does not fit; names the data and both shapes.
+    """
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"data {entry.name!r}: expected numbers, got {value!r}") from error
+    shape, rows = entry.shape, entry.rows
+    if array.size == rows * entry.size and array.shape in ((rows, *shape), shape if rows == 1 else ()):
+        return array.reshape(rows, entry.size)
+    if array.shape == shape:
+        return np.broadcast_to(array.reshape(1, entry.size), (rows, entry.size))
+    if array.shape == (rows,) and entry.size == 1:
+        return array.reshape(rows, 1)
+    if array.shape == (rows, entry.size):
+        return array
+    expected = f"{shape}" if entry.count is None else f"{(rows, *shape)}"
+    raise ShapeError(f"data {entry.name!r}: expected shape {expected}, got {array.shape}")
+
+
+def check_bounds(term: Term, dim: int) -> None:
+    """Constant bounds of an inequality: shapes, NaN, crossing."""
+    given = {}
+    for key in ("lower", "upper"):
+        value = getattr(term, key)
+        if not isinstance(value, DataSlot):
+            given[key] = constant_rows(value, dim, term.count, f"{term.what}: {key}")
+            if np.isnan(given[key]).any():
+                raise DataError(f"{term.what}: {key} has a NaN; leave a bound out with an infinity")
+    if len(given) == 2 and (given["lower"] > given["upper"]).any():
+        row, part = np.argwhere(given["lower"] > given["upper"])[0]
+        raise EmptyConstraintError(
+            f"{term.what}: no point satisfies instance {row}, row {part}: lower "
+            f"{given['lower'][row, part]:g} is above upper {given['upper'][row, part]:g}"
+        )
+
+
+def constant_rows(value: Any, dim: int, count: int, what: str) -> np.ndarray:
+    """A number, (dim,), (count,) for dim 1, or (count, dim) as (count, dim)."""
+    array = np.asarray(value, dtype=float)
+    if array.shape == (count,) and dim == 1:
+        array = array[:, None]
+    try:
+        return np.broadcast_to(array, (count, dim))
+    except ValueError:
+        raise ShapeError(f"{what} must be a number, ({dim},) or ({count}, {dim}); got shape {array.shape}") from None
+
+
+@dataclass(frozen=True, eq=False)
+class TermLayout:
+    """Where the instances of a term read and write.
+
+    Attributes:
+        stored: (count, all stored coordinates of its slots) positions in the point.
+        columns: (count, width) positions in the tangent step.
+        blocks: (count, slots) numbers of the variable instances.
+        numbers: (count, all numbers of its data) positions in the data.
+        linear: (1 or count, size) positions of the linear part given as data, or None.
+    """
+
+    term: Term
+    stored: np.ndarray
+    columns: np.ndarray
+    blocks: np.ndarray
+    numbers: np.ndarray
+    linear: np.ndarray | None
+
+
+class Layout:
+    """Positions of variables, data and terms of a problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.stored_start: dict[str, int] = {}
+        self.start: dict[str, int] = {}
+        self.block_start: dict[str, int] = {}
+        stored = tangent = block = 0
+        dims: list[np.ndarray] = []
+        for variable in problem.unknowns.values():
+            self.stored_start[variable.name] = stored
+            self.start[variable.name] = tangent
+            self.block_start[variable.name] = block
+            stored += variable.count * variable.space.ambient
+            tangent += variable.count * variable.space.dim
+            block += variable.count
+            dims.append(np.full(variable.count, variable.space.dim))
+        self.stored_size, self.size = stored, tangent
+        self.block_dims = np.concatenate(dims) if dims else np.zeros(0, int)
+        self.block_columns = np.concatenate([[0], np.cumsum(self.block_dims)]).astype(np.intp)
+        self.data_start: dict[str, int] = {}
+        numbers = 0
+        for entry in problem.inputs.values():
+            self.data_start[entry.name] = numbers
+            numbers += entry.rows * entry.size
+        self.data_size = numbers
+        self.terms = [self._term(term) for term in problem.terms.values()]
+
+    def columns(self, slot: Slot) -> np.ndarray:
+        """(instances, dim) positions of a slot's tangent coordinates."""
+        dim = slot.source.space.dim
+        return self.start[slot.source.name] + slot.indices[:, None] * dim + np.arange(dim)
+
+    def numbers(self, slot: DataSlot) -> np.ndarray:
+        """(rows, size) positions of a data slot's numbers."""
+        size = slot.source.size
+        return self.data_start[slot.source.name] + slot.indices[:, None] * size + np.arange(size)
+
+    def _stored(self, slot: Slot) -> np.ndarray:
+        ambient = slot.source.space.ambient
+        return self.stored_start[slot.source.name] + slot.indices[:, None] * ambient + np.arange(ambient)
+
+    def _term(self, term: Term) -> TermLayout:
+        def rows(parts: list[np.ndarray]) -> np.ndarray:
+            if not parts:
+                return np.zeros((term.count, 0), np.intp)
+            return np.hstack([np.broadcast_to(p, (term.count, p.shape[1])) for p in parts])
+
+        return TermLayout(
+            term,
+            rows([self._stored(s) for s in term.slots]),
+            rows([self.columns(s) for s in term.slots]),
+            rows([self.block_start[s.source.name] + s.indices[:, None] for s in term.slots]),
+            rows([self.numbers(s) for s in term.data]),
+            self.numbers(term.linear) if isinstance(term.linear, DataSlot) else None,
+        )
+
+    def point(self, values: Mapping[str, Any], base: np.ndarray | None = None) -> np.ndarray:
+        """Values by variable name as one array of stored coordinates; others from `base` or the identity.
+
+        Raises:
+            UnknownNameError, DataError: a name that is no variable; a wrong shape or a value that is not finite.
+        """
+        for name in values:
+            if name not in self.problem.unknowns:
+                raise UnknownNameError("variable", name, self.problem.unknowns)
+        point = self.identity() if base is None else base.copy()
+        for name, value in values.items():
+            variable = self.problem.unknowns[name]
+            start = self.stored_start[name]
+            array = points(variable.space, value, variable.count, f"value of {name!r}")
+            point[start : start + array.size] = array.ravel()
+        return point
+
+    def identity(self) -> np.ndarray:
+        parts = [np.tile(v.space.identity(), v.count) for v in self.problem.unknowns.values()]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def values(self, point: np.ndarray) -> dict[str, np.ndarray]:
+        """Views (count, ambient) into `point` by variable name."""
+        return {name: self.value(point, name) for name in self.problem.unknowns}
+
+    def value(self, point: np.ndarray, name: str) -> np.ndarray:
+        variable = self.problem.unknowns[name]
+        start, ambient = self.stored_start[name], variable.space.ambient
+        return point[..., start : start + variable.count * ambient].reshape(
+            *point.shape[:-1], variable.count, ambient
+        )
+
+    def retract(self, point: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """The point moved by a tangent step."""
+        out = np.empty_like(point)
+        for name, variable in self.problem.unknowns.items():
+            s, t = self.stored_start[name], self.start[name]
+            ambient, dim = variable.space.ambient, variable.space.dim
+            x = point[s : s + variable.count * ambient].reshape(-1, ambient)
+            d = step[t : t + variable.count * dim].reshape(-1, dim)
+            out[s : s + variable.count * ambient] = variable.space.retract_array(x, d).ravel()
+        return out
+
+
+class DataStore:
+    """The numbers a session was given so far; names keep their values until they are given anew."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.numbers = np.full(layout.data_size, np.nan)
+        self.given = {name: False for name in layout.problem.inputs}
+        self._views: dict[str, np.ndarray] = {}
+        self._flags = {d.of.name: d.name for d in layout.problem.inputs.values() if d.of is not None}
+        for name, entry in layout.problem.inputs.items():
+            start = layout.data_start[name]
+            self._views[name] = self.numbers[start : start + entry.rows * entry.size].reshape(entry.rows, entry.size)
+            if entry.value is not None:
+                self.set(name, entry.value)
+
+    def copy(self, numbers: np.ndarray | None = None) -> DataStore:
+        """An independent store with the same numbers, or with others."""
+        other = DataStore(self.layout)
+        other.numbers[:] = self.numbers if numbers is None else numbers
+        other.given = dict(self.given)
+        return other
+
+    def set(self, name: str, value: Any) -> None:
+        """Take new numbers. Raises UnknownNameError or ShapeError."""
+        view = self._views.get(name)
+        if view is None:
+            raise UnknownNameError("data", name, [n for n in self._views if not n.startswith("presence(")])
+        if type(value) is np.ndarray and value.shape == view.shape:
+            view[...] = value
+        else:
+            view[...] = data_rows(self.layout.problem.inputs[name], value)
+        self.given[name] = True
+        if name in self._flags:
+            self._views[self._flags[name]][:, 0] = ~np.isnan(view).any(axis=1)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """(rows, size) view of the numbers of `name`."""
+        return self._views[name]
+
+    def require_all(self) -> None:
+        """Raises DataError naming data that were never given."""
+        missing = [name for name, given in self.given.items() if not given]
+        if missing:
+            raise DataError(
+                f"data never given and without default: {', '.join(missing)}; pass them to solve or update"
+            )
+
+
+class Activity:
+    """Which instances of costs and inequalities are switched on: no NaN among the data they read, `active` not 0."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._terms: list[tuple[TermLayout, np.ndarray, np.ndarray | None]] = []
+        for entry in layout.terms:
+            term = entry.term
+            flagged = {s.source.of.name for s in term.data if s.source.of is not None}
+            reads = [layout.numbers(s) for s in term.data if s.source.of is None and s.source.name not in flagged]
+            if isinstance(term.linear, DataSlot):
+                reads.append(layout.numbers(term.linear))
+            index = np.hstack([np.broadcast_to(r, (term.count, r.shape[1])) for r in reads] or [np.zeros((term.count, 0), int)])
+            switch = None
+            if isinstance(term.active, DataSlot):
+                switch = np.broadcast_to(layout.numbers(term.active), (term.count, 1))[:, 0]
+            self._terms.append((entry, index, switch))
+        # weights and flags are checked where they are used, so a NaN there is an error and not a pattern
+        self.switches = np.unique(np.concatenate([s for _, _, s in self._terms if s is not None] or [np.zeros(0, int)]))
+        self.constant = [
+            None
+            if term.term.active is None or isinstance(term.term.active, DataSlot)
+            else np.broadcast_to(np.asarray(term.term.active, dtype=bool), (term.term.count,))
+            for term, _, _ in self._terms
+        ]
+
+    def key(self, numbers: np.ndarray) -> bytes:
+        """Identifies the pattern; equal keys give equal `flags`."""
+        missing = np.isnan(numbers)
+        head = missing.tobytes() if missing.any() else b""
+        return head + b"|" + numbers[self.switches].tobytes() if self.switches.size else head
+
+    def flags(self, numbers: np.ndarray) -> list[np.ndarray | None]:
+        """For each term (count,) booleans, or None where all are on.
+
+        Raises:
+            DataError: an equality reads missing data without their presence flags; a switch is NaN.
+        """
+        out: list[np.ndarray | None] = []
+        missing = np.isnan(numbers)
+        for (entry, index, switch), constant in zip(self._terms, self.constant, strict=True):
+            on = ~missing[index].any(axis=1)
+            if entry.term.kind == "equality":
+                if not on.all():
+                    raise DataError(
+                        f"{entry.term.what}: instance {int(np.flatnonzero(~on)[0])} reads missing data; let it read "
+                        "presence(data) too and say what holds without them"
+                    )
+                out.append(None)
+                continue
+            if switch is not None:
+                if np.isnan(numbers[switch]).any():
+                    raise DataError(f"{entry.term.what}: its active flags contain a NaN; use 1 and 0")
+                on &= numbers[switch] != 0
+            if constant is not None:
+                on &= constant
+            out.append(None if on.all() else on)
+        return out

@@ -1,0 +1,204 @@
+"""Symbols to array code: the instructions of a CasADi SX function replayed as NumPy operations on many instances.
+
+One Python function is generated per template. It walks over chunks of instances that fit the cache and keeps all
+intermediate values in reused buffers, so the cost per instance is a few array passes and no Python (design section 7).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from problems.errors import DefinitionError
+from problems.forms.template import Template, template_of
+from problems.problem import Term
+
+CHUNK = 1024
+
+_BINARY = {
+    ca.OP_ADD: "np.add",
+    ca.OP_SUB: "np.subtract",
+    ca.OP_MUL: "np.multiply",
+    ca.OP_DIV: "np.divide",
+    ca.OP_POW: "np.power",
+    ca.OP_CONSTPOW: "np.power",
+    ca.OP_LT: "np.less",
+    ca.OP_LE: "np.less_equal",
+    ca.OP_EQ: "np.equal",
+    ca.OP_NE: "np.not_equal",
+    ca.OP_AND: "np.logical_and",
+    ca.OP_OR: "np.logical_or",
+    ca.OP_FMOD: "np.fmod",
+    ca.OP_COPYSIGN: "np.copysign",
+    ca.OP_FMIN: "np.fmin",
+    ca.OP_FMAX: "np.fmax",
+    ca.OP_ATAN2: "np.arctan2",
+    ca.OP_HYPOT: "np.hypot",
+}
+_UNARY = {
+    ca.OP_NEG: "np.negative",
+    ca.OP_EXP: "np.exp",
+    ca.OP_LOG: "np.log",
+    ca.OP_SQRT: "np.sqrt",
+    ca.OP_SQ: "np.square",
+    ca.OP_SIN: "np.sin",
+    ca.OP_COS: "np.cos",
+    ca.OP_TAN: "np.tan",
+    ca.OP_ASIN: "np.arcsin",
+    ca.OP_ACOS: "np.arccos",
+    ca.OP_ATAN: "np.arctan",
+    ca.OP_SINH: "np.sinh",
+    ca.OP_COSH: "np.cosh",
+    ca.OP_TANH: "np.tanh",
+    ca.OP_ASINH: "np.arcsinh",
+    ca.OP_ACOSH: "np.arccosh",
+    ca.OP_ATANH: "np.arctanh",
+    ca.OP_NOT: "np.logical_not",
+    ca.OP_FLOOR: "np.floor",
+    ca.OP_CEIL: "np.ceil",
+    ca.OP_FABS: "np.abs",
+    ca.OP_SIGN: "np.sign",
+    ca.OP_INV: "np.reciprocal",
+    ca.OP_LOG1P: "np.log1p",
+    ca.OP_EXPM1: "np.expm1",
+}
+
+
+class ArrayCode:
+    """An SX function of scalars, evaluated on arrays of instances.
+
+    Args:
+        inputs: SX column of the scalar inputs.
+        outputs: SX column of the scalar outputs.
+
+    Calling it with one entry per input, an array (count,) or a number shared by all instances, returns (outputs,
+    count). Constant outputs cost nothing but their fill.
+    """
+
+    def __init__(self, inputs: ca.SX, outputs: ca.SX) -> None:
+        outputs = ca.densify(outputs)
+        self.inputs, self.outputs = inputs.shape[0], outputs.shape[0]
+        self.function = ca.Function("code", [inputs], [ca.cse(outputs)])
+        self._variants: dict[tuple[bool, ...], Callable[..., None]] = {}
+
+    def __call__(self, values: Sequence[Any], count: int, out: np.ndarray | None = None) -> np.ndarray:
+        arrays = tuple(isinstance(v, np.ndarray) and v.ndim == 1 for v in values)
+        code = self._variants.get(arrays)
+        if code is None:
+            code = self._variants[arrays] = _generate(self.function, arrays)
+        if out is None:
+            out = np.empty((self.outputs, count))
+        with np.errstate(all="ignore"):
+            code(values, out, count)
+        return out
+
+
+def _generate(function: ca.Function, arrays: tuple[bool, ...]) -> Callable[..., None]:
+    """Python source of one chunk loop, with scalar inputs folded into scalar arithmetic."""
+    place: dict[int, tuple[str, bool]] = {}  # work register -> (name, is an array)
+    buffers: set[int] = set()
+    before: list[str] = []
+    body: list[str] = []
+    scalars = 0
+
+    def scalar(expression: str) -> tuple[str, bool]:
+        nonlocal scalars
+        scalars += 1
+        before.append(f"s{scalars} = {expression}")
+        return f"s{scalars}", False
+
+    for k in range(function.n_instructions()):
+        op = function.instruction_id(k)
+        if op == ca.OP_OUTPUT:
+            row = function.instruction_output(k)[1]
+            body.append(f"out[{row}, lo:hi] = {place[function.instruction_input(k)[0]][0]}")
+            continue
+        register = function.instruction_output(k)[0]
+        if op == ca.OP_CONST:
+            place[register] = (repr(float(function.instruction_constant(k))), False)
+            if not math.isfinite(function.instruction_constant(k)):
+                place[register] = (f"float('{function.instruction_constant(k)}')", False)
+            continue
+        if op == ca.OP_INPUT:
+            index = function.instruction_input(k)[1]
+            if arrays[index]:
+                body.append(f"a{index} = values[{index}][lo:hi]")
+                place[register] = (f"a{index}", True)
+            else:
+                place[register] = scalar(f"np.float64(values[{index}])")
+            continue
+        operands = [place[r] for r in function.instruction_input(k)]
+        names = [name for name, _ in operands]
+        if op == ca.OP_ASSIGN:
+            names, op = [names[0], "1.0"], ca.OP_MUL
+        if op == ca.OP_TWICE:
+            names, op = [names[0], "2.0"], ca.OP_MUL
+        if op == ca.OP_IF_ELSE_ZERO:
+            expression = f"np.where({names[0]}, {names[1]}, 0.0)"
+        elif op in _BINARY:
+            expression = f"{_BINARY[op]}({names[0]}, {names[1]}"
+        elif op in _UNARY:
+            expression = f"{_UNARY[op]}({names[0]}"
+        else:
+            raise DefinitionError(f"the residual uses CasADi operation {op}, which array code does not know")
+        if any(is_array for _, is_array in operands):
+            buffers.add(register)
+            target = f"b{register}"
+            body.append(
+                f"{target}[:] = {expression}"
+                if op == ca.OP_IF_ELSE_ZERO
+                else f"{expression}, out={target})"
+            )
+            place[register] = (target, True)
+        else:
+            place[register] = scalar(expression if op == ca.OP_IF_ELSE_ZERO else f"{expression}) * 1.0")
+    views = [f"b{r} = work[{i}, :hi - lo]" for i, r in enumerate(sorted(buffers))]
+    lines = [
+        "def run(values, out, count):",
+        f"    work = np.empty(({max(len(buffers), 1)}, min(count, {CHUNK})))",
+        *(f"    {line}" for line in before),
+        f"    for lo in range(0, count, {CHUNK}):",
+        f"        hi = min(lo + {CHUNK}, count)",
+        *(f"        {line}" for line in views + body),
+    ]
+    scope: dict[str, Any] = {"np": np}
+    exec(compile("\n".join(lines), "<residual code>", "exec"), scope)  # noqa: S102
+    return scope["run"]
+
+
+class ResidualCode:
+    """Residuals and tangent Jacobians of all instances of a term (design section 3.1).
+
+    `residual(values)` is (count, dim); `jacobian(values)` is (count, dim, width). `values` lists one entry per scalar
+    input, the stored coordinates of all slots and then all data: an array (count,) or a number.
+    """
+
+    def __init__(self, template: Template) -> None:
+        self.template = template
+        inputs = ca.vertcat(template.point, template.numbers)
+        self._residual = ArrayCode(inputs, template.residual)
+        both = ca.vertcat(template.residual, ca.vec(ca.densify(template.jacobian)))
+        self._both = ArrayCode(inputs, both)
+
+    def residual(self, values: Sequence[Any], count: int) -> np.ndarray:
+        return self._residual(values, count).T
+
+    def residual_and_jacobian(self, values: Sequence[Any], count: int) -> tuple[np.ndarray, np.ndarray]:
+        out = self._both(values, count)
+        dim, width = self.template.dim, self.template.width
+        return out[:dim].T, out[dim:].reshape(width, dim, count).transpose(2, 1, 0)
+
+
+@lru_cache(maxsize=1024)
+def _code_of(template: Template) -> ResidualCode:
+    return ResidualCode(template)
+
+
+def residual_code(term: Term) -> ResidualCode:
+    """The array code of a term's template, generated once per process."""
+    return _code_of(template_of(term))

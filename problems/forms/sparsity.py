@@ -1,0 +1,102 @@
+"""Sparsity of the Gauss-Newton Hessian of all costs, and where each term adds its entries.
+
+The matrix is stored by columns, upper triangle (what LDL' factorizations take). The pattern is found once on pairs of
+variable instances; an assembly is one weighted count per term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from problems.forms.layout import Layout, TermLayout
+
+
+class HessianPattern:
+    """Upper triangle of the Hessian by columns.
+
+    Attributes:
+        size: unknowns.
+        indptr, indices: compressed columns.
+        diagonal: position of every diagonal entry.
+    """
+
+    def __init__(self, layout: Layout, terms: Sequence[tuple[TermLayout, Sequence[tuple[int, int]]]]) -> None:
+        blocks = layout.block_dims.size
+        dims, start = layout.block_dims, layout.block_columns
+        keys = [np.arange(blocks) * blocks + np.arange(blocks)]
+        for entry, _ in terms:
+            slots = entry.blocks.shape[1]
+            for a in range(slots):
+                for b in range(a + 1, slots):
+                    keys.append(_key(entry.blocks[:, a], entry.blocks[:, b], blocks))
+        unique = np.unique(np.concatenate(keys))
+        col, row = unique // blocks, unique % blocks  # sorted by column, then row; the diagonal block is last
+        height = dims[row]
+        first = np.searchsorted(col, np.arange(blocks))
+        before = np.cumsum(height) - height
+        above = before - before[first][col]  # rows of the column above this block
+        off = np.zeros(blocks, np.intp)
+        np.add.at(off, col[row != col], height[row != col])
+        length = np.repeat(off, dims) + _ramp(dims) + 1
+        self.size = int(dims.sum())
+        self.indptr = np.concatenate([[0], np.cumsum(length)]).astype(np.intp)
+        self.diagonal = self.indptr[1:] - 1
+        self._unique, self._above, self._blocks, self._start = unique, above, blocks, start
+        self.indices = self._row_indices(col, row, dims)
+        self.positions = [self._positions(entry, pairs) for entry, pairs in terms]
+
+    @property
+    def nonzeros(self) -> int:
+        return int(self.indptr[-1])
+
+    def _row_indices(self, col: np.ndarray, row: np.ndarray, dims: np.ndarray) -> np.ndarray:
+        indices = np.empty(self.nonzeros, np.intp)
+        for width in np.unique(dims):
+            for height in np.unique(dims):
+                pick = np.flatnonzero((dims[col] == width) & (dims[row] == height))
+                c, r, up = col[pick], row[pick], self._above[pick]
+                same = c == r
+                for b in range(width):
+                    at = self.indptr[self._start[c] + b] + up
+                    for a in range(height):
+                        use = ~same | (a <= b)
+                        indices[at[use] + a] = self._start[r[use]] + a
+        return indices
+
+    def _positions(self, entry: TermLayout, pairs: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray | None]:
+        """Positions (pairs, count) of the entries; those that count twice (one instance in two slots), if any."""
+        slot_dims = [int(s.source.space.dim) for s in entry.term.slots]
+        slot_of = np.repeat(np.arange(len(slot_dims)), slot_dims)
+        local = _ramp(np.array(slot_dims))
+        out = np.empty((len(pairs), entry.term.count), np.intp)
+        twice = []
+        cache: dict[tuple[int, int], np.ndarray] = {}
+        for k, (p, q) in enumerate(pairs):
+            s, t = slot_of[p], slot_of[q]
+            bi, bj = entry.blocks[:, s], entry.blocks[:, t]
+            if (s, t) not in cache:
+                cache[s, t] = self._above[np.searchsorted(self._unique, _key(bi, bj, self._blocks))]
+            up = cache[s, t]
+            ci, cj = self._start[bi] + local[p], self._start[bj] + local[q]
+            swap = ci > cj
+            column, inner = np.where(swap, ci, cj), np.where(swap, local[q], local[p])
+            out[k] = self.indptr[column] + up + inner
+            if p != q and (ci == cj).any():
+                twice.append(np.where(ci == cj, out[k], -1))
+            else:
+                twice.append(None)
+        if all(t is None for t in twice):
+            return out, None
+        return out, np.array([np.full(entry.term.count, -1) if t is None else t for t in twice])
+
+
+def _key(a: np.ndarray, b: np.ndarray, blocks: int) -> np.ndarray:
+    return np.maximum(a, b) * blocks + np.minimum(a, b)
+
+
+def _ramp(dims: np.ndarray) -> np.ndarray:
+    """0..d-1 for every d, one after the other."""
+    total = int(dims.sum())
+    return np.arange(total) - np.repeat(np.cumsum(dims) - dims, dims)

@@ -1,0 +1,160 @@
+"""The symbols of one term template: residual, its Jacobian in tangent coordinates, and how data enter.
+
+A template is made once per process for each residual function, spaces and data shapes. Everything numeric (array code,
+QP rows, NLPs, graphs) is generated from these symbols; no Jacobian is written by hand anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from problems.errors import DefinitionError, ShapeError
+from problems.problem import Term
+from problems.spaces import Space, Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """Symbols of a residual.
+
+    Attributes:
+        x: stored coordinates of each slot, SX columns.
+        data: each datum, SX columns in row-major order.
+        residual: SX (dim, 1).
+        jacobian: SX (dim, width): derivative in tangent coordinates of all slots, side by side.
+        dims: tangent dimension of each slot; `width` is their sum.
+        affine: the residual is affine in the variables (coefficients may depend on data).
+    """
+
+    x: tuple[ca.SX, ...]
+    data: tuple[ca.SX, ...]
+    residual: ca.SX
+    jacobian: ca.SX
+    dims: tuple[int, ...]
+    affine: bool
+
+    @property
+    def dim(self) -> int:
+        return self.residual.shape[0]
+
+    @property
+    def width(self) -> int:
+        return sum(self.dims)
+
+    @property
+    def point(self) -> ca.SX:
+        """All stored coordinates as one column."""
+        return ca.vertcat(*self.x)
+
+    @property
+    def numbers(self) -> ca.SX:
+        """All data as one column."""
+        return ca.vertcat(*self.data) if self.data else ca.SX(0, 1)
+
+    @property
+    def nonlinear_data(self) -> tuple[bool, ...]:
+        """For each datum: does it multiply a variable or enter nonlinearly on its own?"""
+        return tuple(
+            bool(ca.depends_on(self.jacobian, d) or ca.depends_on(ca.jacobian(self.residual, d), d))
+            for d in self.data
+        )
+
+    @property
+    def products(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of data (by position) that multiply each other."""
+        pairs = []
+        for i, d in enumerate(self.data):
+            partial = ca.jacobian(self.residual, d)
+            pairs += [(i, j) for j in range(i + 1, len(self.data)) if ca.depends_on(partial, self.data[j])]
+        return tuple(pairs)
+
+
+def template_of(term: Term) -> Template:
+    """The template of a term.
+
+    Raises:
+        DefinitionError: the residual raises, or returns something that is no expression; names the term.
+        ShapeError: it returns a matrix.
+    """
+    spaces = tuple(slot.source.space for slot in term.slots)
+    shapes = tuple(slot.source.shape for slot in term.data)
+    try:
+        return _template(term.residual, spaces, shapes)
+    except (DefinitionError, ShapeError) as error:
+        raise type(error)(f"{term.what}: {error}") from error.__cause__
+
+
+@lru_cache(maxsize=1024)
+def _template(
+    residual: Callable[..., Any], spaces: tuple[Space, ...], shapes: tuple[tuple[int, ...], ...]
+) -> Template:
+    x = tuple(ca.SX.sym(f"x{i}", space.ambient) for i, space in enumerate(spaces))
+    d = tuple(ca.SX.sym(f"d{i}", int(np.prod(shape, dtype=int))) for i, shape in enumerate(shapes))
+    elements = [space.element(xi) for space, xi in zip(spaces, x, strict=True)]
+    rows = [_shaped(di, shape) for di, shape in zip(d, shapes, strict=True)]
+    r = _column(_call(residual, elements, rows))
+    allowed = [*x, *d]
+    free = [s.name() for s in ca.symvar(r) if not any(ca.depends_on(a, s) for a in allowed)]
+    if free:
+        raise DefinitionError(f"the residual contains symbols that are neither slots nor data: {', '.join(free)}")
+    jacobian = _tangent_jacobian(r, x, spaces)
+    affine = all(isinstance(space, Vector) for space in spaces) and not ca.depends_on(jacobian, ca.vertcat(*x))
+    return Template(x, d, r, jacobian, tuple(space.dim for space in spaces), affine)
+
+
+def _shaped(symbol: ca.SX, shape: tuple[int, ...]) -> ca.SX:
+    return ca.reshape(symbol, shape[1], shape[0]).T if len(shape) == 2 else symbol
+
+
+def _call(residual: Callable[..., Any], elements: list[Any], rows: list[ca.SX]) -> Any:
+    name = getattr(residual, "__name__", repr(residual))
+    given = ", ".join(
+        [getattr(e, "__class__").__name__ if not isinstance(e, ca.SX) else f"column of {e.shape[0]}" for e in elements]
+        + [f"data {tuple(r.shape)}" for r in rows]
+    )
+    try:
+        return residual(*elements, *rows)
+    except Exception as error:
+        first = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
+        raise DefinitionError(
+            f"the residual {name} failed when called with symbols ({given}): {type(error).__name__}: {first}. "
+            "It must be a function of CasADi columns; write vectors as columns and use casadi functions"
+        ) from error
+
+
+def _column(value: Any) -> ca.SX:
+    if isinstance(value, (list, tuple)):
+        try:
+            value = ca.vertcat(*value)
+        except Exception as error:
+            raise DefinitionError(f"the residual returned a list that is no column: {error}") from error
+    try:
+        r = ca.SX(value)
+    except Exception as error:
+        raise DefinitionError(
+            f"the residual must return a CasADi column, a list of expressions or numbers; got {type(value).__name__}"
+        ) from error
+    r = ca.densify(r)
+    if r.shape[0] == 1 and r.shape[1] > 1:
+        r = r.T
+    if r.shape[1] != 1 or r.shape[0] == 0:
+        raise ShapeError(f"the residual must be one column, got shape {r.shape}")
+    return r
+
+
+def _tangent_jacobian(r: ca.SX, x: tuple[ca.SX, ...], spaces: tuple[Space, ...]) -> ca.SX:
+    blocks = []
+    for xi, space in zip(x, spaces, strict=True):
+        block = ca.jacobian(r, xi)
+        if not isinstance(space, Vector):
+            delta = ca.SX.sym("delta", space.dim)
+            chart = ca.substitute(ca.jacobian(space.retract(xi, delta), delta), delta, ca.SX.zeros(space.dim))
+            block = block @ ca.sparsify(chart)
+        blocks.append(block)
+    return ca.simplify(ca.horzcat(*blocks)) if len(blocks) > 1 else ca.simplify(blocks[0])

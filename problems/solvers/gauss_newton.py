@@ -1,0 +1,256 @@
+"""Our own solver for nonlinear least squares on manifolds: damped Gauss-Newton, inequalities by SQP.
+
+Steps are computed from ``(H + lambda D) dx = -g`` with D the diagonal of H; lambda is zero until a step fails to reduce
+the cost (Levenberg-Marquardt, Marquardt 1963; Nocedal and Wright, ch. 10). Constraints are linearized in the tangent
+of the iterate and the step becomes a QP; steps are accepted on an l1 merit function (Nocedal and Wright, ch. 18).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from problems.forms.layout import Layout
+from problems.forms.least_squares import Bound, Constraints, LeastSquares
+from problems.forms.pins import Pins
+from problems.problem import Problem
+from problems.solvers.base import Options, Status
+from problems.solvers.least_squares_solution import LeastSquaresCheck
+from problems.solvers.linear import SingularError, factorization
+from problems.solvers.qp_step import QPStep
+from problems.solvers.session import Session, Solution
+from problems.solvers.settings import read_settings
+
+DAMPING_START = 1e-6
+DAMPING_LIMIT = 1e12
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Own settings of ``gauss-newton``.
+
+    Attributes:
+        qp_solver: QP backend for inequalities; by default daqp for small problems and proxqp for large ones.
+        whole: one compiled function for the whole problem (True), array code (False), or by size (None).
+        iterations: exact number of steps without convergence test (real-time iteration); None iterates to convergence.
+    """
+
+    qp_solver: str | None = None
+    whole: bool | None = None
+    iterations: int | None = None
+
+
+class GaussNewton(Session):
+    """Session of the solver ``gauss-newton``."""
+
+    form = "graph"
+    forms = ("graph",)
+    warm_starts = True
+    extra = None
+
+    def __init__(self, problem: Problem, options: Options) -> None:
+        self.settings = read_settings(Settings, options.extra, "gauss-newton")
+        layout = Layout(problem)
+        super().__init__(problem, layout, "gauss-newton", options)
+        self.form_ = LeastSquares(problem, layout, self.settings.whole)
+        self.pins = Pins(layout)
+        self.constraints = Constraints(layout, self.pins.names)
+        pattern = self.form_.pattern
+        self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+        self._linear = factorization(pattern)
+        self._step = QPStep(pattern, self.constraints, self.pins, options, self.settings.qp_solver)
+        self._prepared: tuple[np.ndarray, np.ndarray] | None = None
+
+    @classmethod
+    def compile(cls, problem: Problem, form: str, options: Options) -> GaussNewton:
+        return cls(problem, options)
+
+    @classmethod
+    def version(cls) -> str:
+        from problems.solvers.settings import own_version
+
+        return own_version()
+
+    def _forked(self) -> None:
+        self._linear = factorization(self.form_.pattern)
+        self._step = QPStep(self.form_.pattern, self.constraints, self.pins, self.options, self.settings.qp_solver)
+        self._prepared = None
+
+    def prepare(self, initial: Mapping[str, Any] | None = None) -> None:
+        """Linearize and factorize at `initial` with the data given so far; the next solve is one feedback step."""
+        if initial is not None:
+            self._point = self.layout.point(initial, self._point)
+        self.store.require_all()
+        start = self.layout.identity() if self._point is None else self._point
+        bound = self.form_.bind(self.store)
+        point = self.pins.apply(start, bound.numbers)
+        _, gradient, hessian = bound.linearize(point)
+        self.pins.reduce(gradient, hessian, self.form_.pattern)
+        self._linear.factor(hessian)
+        self._prepared = (point, hessian)
+
+    def _solve(self) -> Solution:
+        bound = self.form_.bind(self.store)
+        start = self.layout.identity() if self._point is None else self._point
+        prepared, self._prepared = self._prepared, None
+        if prepared is None:
+            search = _Search(self, bound, self.pins.apply(start, bound.numbers))
+            status, message = search.run()
+        else:
+            search = _Search(self, bound, prepared[0])
+            status, message = search.feedback(prepared[1])
+        check = LeastSquaresCheck(
+            self.form_, self.constraints, self.pins, bound, search.point, search.multipliers
+        )
+        return Solution(self.layout, search.point, status, self.solver, check, search.iterations, message)
+
+
+class _Search:
+    """One solve: the iterate, its cost and the damping."""
+
+    def __init__(self, session: GaussNewton, bound: Bound, point: np.ndarray) -> None:
+        self.session, self.bound, self.point = session, bound, point
+        self.options, self.layout = session.options, session.layout
+        self.diagonal = session.form_.pattern.diagonal
+        self.damping = 0.0
+        self.iterations = 0
+        self.multipliers: np.ndarray | None = None
+        self.penalty = 0.0
+        self.numbers = bound.numbers
+        if session.constraints.size:
+            self.lower, self.upper = session.constraints.bounds(bound.numbers, bound.flags)
+
+    def run(self) -> tuple[Status, str]:
+        deadline = time.perf_counter() + self.options.time_limit
+        fixed = self.session.settings.iterations
+        limit = fixed or self.options.iteration_limit or 100
+        tolerance = 0.1 * self.options.tolerance
+        while self.iterations < limit:
+            if time.perf_counter() > deadline:
+                return Status.TIME_LIMIT, f"stopped after {self.options.time_limit:g} s"
+            cost, gradient, hessian = self.bound.linearize(self.point)
+            if not np.isfinite(cost):
+                return Status.FAILED, "the cost is not finite at the iterate"
+            self.iterations += 1
+            outcome = self._advance(cost, gradient, hessian, tolerance, fixed is not None)
+            if outcome is not None and fixed is None:
+                return outcome
+        if fixed is not None:
+            return Status.SOLVED, f"{fixed} iteration(s) as asked, convergence not tested"
+        return Status.ITERATION_LIMIT, f"not converged after {limit} iterations"
+
+    def feedback(self, hessian: np.ndarray) -> tuple[Status, str]:
+        """One full step with the matrix factorized by `GaussNewton.prepare`."""
+        session = self.session
+        _, gradient, _ = self.bound.linearize(self.point)
+        gradient[session.pins.columns] = 0.0
+        step = -session._linear.solve(gradient)
+        if session.constraints.size:
+            failed, step = self._constrained(step, gradient, hessian)
+            if failed is not None:
+                return failed
+        if not np.isfinite(step).all():
+            return Status.FAILED, "no finite feedback step"
+        self.point = self.layout.retract(self.point, step)
+        self.iterations = 1
+        return Status.SOLVED, "one feedback step as prepared, convergence not tested"
+
+    def _advance(
+        self, cost: float, gradient: np.ndarray, hessian: np.ndarray, tolerance: float, forced: bool
+    ) -> tuple[Status, str] | None:
+        """One accepted step, or the reason to stop."""
+        session = self.session
+        session.pins.reduce(gradient, hessian, session.form_.pattern)
+        violation = self._violation(self.point)
+        while True:
+            damped = hessian
+            if self.damping > 0:
+                damped = hessian.copy()
+                damped[self.diagonal] += self.damping * np.maximum(hessian[self.diagonal], 1e-12)
+            try:
+                session._linear.factor(damped)
+                step = -session._linear.solve(gradient)
+                if not np.isfinite(step).all():
+                    raise SingularError("no finite step")
+            except SingularError as error:
+                if self.damping == 0 and not session.constraints.size:
+                    free = self._free(hessian)
+                    if free:
+                        return Status.UNBOUNDED, f"the costs leave {free} free ({error})"
+                if not self._harder():
+                    return Status.FAILED, f"no step found: {error}"
+                continue
+            failed = None
+            if session.constraints.size:
+                failed, step = self._constrained(step, gradient, damped)
+                if failed is not None:
+                    return failed
+            decrease = -float(gradient @ step) - self._curvature(hessian, step) / 2
+            small = abs(decrease) <= tolerance * max(1.0, cost) and self.damping <= DAMPING_START
+            trial = self.layout.retract(self.point, step)
+            if forced:
+                self.point = trial
+                return None
+            new = self.bound.cost(trial)
+            new_violation = self._violation(trial)
+            if session.constraints.size:
+                self.penalty = max(self.penalty, 2 * float(np.abs(self.multipliers).max(initial=0.0)))
+            merit = cost + self.penalty * violation.sum()
+            new_merit = new + self.penalty * new_violation.sum()
+            if np.isfinite(new_merit) and new_merit <= merit + 1e-14 * abs(merit):
+                self.point = trial
+                self.damping = self.damping / 10 if self.damping > 1e-9 else 0.0
+                if small and new_violation.max(initial=0.0) <= self.options.tolerance * 10:
+                    return Status.SOLVED, ""
+                return None
+            if small and violation.max(initial=0.0) <= self.options.tolerance * 10:
+                return Status.SOLVED, ""  # no descent left above rounding
+            if not self._harder():
+                return Status.INACCURATE, f"no descent found; predicted decrease {decrease:.3g}"
+
+    def _harder(self) -> bool:
+        self.damping = max(DAMPING_START, self.damping * 10)
+        return self.damping <= DAMPING_LIMIT
+
+    def _constrained(
+        self, step: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
+    ) -> tuple[tuple[Status, str] | None, np.ndarray]:
+        """The step that satisfies the linearized constraints; the free one where it does already."""
+        constraints = self.session.constraints
+        values, entries = constraints.evaluate(self.point, self.numbers)
+        rows = values + np.bincount(constraints.rows, entries * step[constraints.columns], constraints.size)
+        if ((rows <= self.upper + self.options.tolerance) & (rows >= self.lower - self.options.tolerance)).all():
+            self.multipliers = np.zeros(constraints.size)
+            return None, step
+        result, status = self.session._step.solve(hessian, gradient, entries, self.lower - values, self.upper - values)
+        if result.x is None or result.y is None or status not in (Status.SOLVED, Status.INACCURATE):
+            return (status, f"QP step: {result.message or status}"), step
+        self.multipliers = result.y
+        return None, result.x
+
+    def _curvature(self, hessian: np.ndarray, step: np.ndarray) -> float:
+        pattern = self.session.form_.pattern
+        products = hessian * step[self.session.hessian_columns] * step[pattern.indices]
+        return float(2 * products.sum() - products[self.diagonal].sum())
+
+    def _violation(self, point: np.ndarray) -> np.ndarray:
+        constraints = self.session.constraints
+        if not constraints.size:
+            return np.zeros(0)
+        values = constraints.residual(point, self.numbers)
+        return np.maximum(np.maximum(values - self.upper, self.lower - values), 0.0)
+
+    def _free(self, hessian: np.ndarray) -> str:
+        names = []
+        diagonal = hessian[self.diagonal]
+        for name, variable in self.session.problem.unknowns.items():
+            start = self.layout.start[name]
+            part = diagonal[start : start + variable.count * variable.space.dim].reshape(variable.count, -1)
+            rows = np.flatnonzero((part <= 0).any(axis=1))
+            if rows.size:
+                names.append(f"{name}[{rows[0]}]" + (f" and {rows.size - 1} more" if rows.size > 1 else ""))
+        return ", ".join(names)

@@ -1,0 +1,192 @@
+"""Sessions on the quadratic form: the affine map first, a QP backend where a row is violated.
+
+`auto` screens: it answers by the affine map whenever no inequality is violated there, and only otherwise calls a
+backend. A solver that was named is always called.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from problems.errors import DataError, SettingError
+from problems.forms.layout import INFINITE
+from problems.forms.quadratic import QuadraticProgram, Reduced, clean
+from problems.solvers.base import Options, QPBackend, QPResult, Status
+from problems.solvers.qp_check import judge
+from problems.solvers.qp_maps import DenseMap, SparseMap, require_observable
+from problems.solvers.qp_solution import QPCheck
+from problems.solvers.session import Session, Solution
+
+MAPS = 64  # patterns of missing data kept between changes of weights
+
+
+class QPSession(Session):
+    """See `Session`; made by `Problem.compile` for every QP backend and for ``auto`` on affine problems.
+
+    Args:
+        program: the lowered problem.
+        backend: class of the QP solver.
+        screen: answer by the affine map where no inequality is violated.
+        warm: start a backend from the last QP solution.
+    """
+
+    form = "quadratic"
+
+    def __init__(
+        self,
+        program: QuadraticProgram,
+        solver: str,
+        backend: type[QPBackend],
+        options: Options,
+        screen: bool,
+        warm: bool = True,
+    ) -> None:
+        super().__init__(program.problem, program.layout, solver, options)
+        self.program = program
+        self.warm = warm
+        self._screen = screen
+        self._backend_type = backend
+        self._slow = frozenset(name for name, speed in program.speeds.items() if speed != "vector")
+        self._switches = program.activity.switches.size > 0
+        self._bound_numbers = _bound_positions(program)
+        self._maps: dict[bytes, DenseMap | SparseMap] = {}
+        self._work: dict[int, Reduced] = {}
+        self._backend: QPBackend | None = None
+        self._loaded: DenseMap | SparseMap | None = None
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._check_without_data()
+
+    def _check_without_data(self) -> None:
+        """What can be seen before any data: unknowns that no cost sees."""
+        needed = [n for n in self._slow if not self.store.given[n]]
+        if needed:
+            return
+        numbers = clean(self.store.numbers)
+        store = self.store.copy(numbers)
+        map_ = self._make(b"", numbers, store)
+        if map_.free is not None:
+            require_observable(self.program, map_.free)
+        if not self._switches:
+            self._maps[b""] = map_
+
+    def _set(self, name: str, value: Any) -> None:
+        if name not in self._slow:
+            self.store.set(name, value)
+            return
+        before = self.store[name].tobytes()
+        self.store.set(name, value)
+        if self.store[name].tobytes() != before:
+            self._maps = {}
+
+    def _update(self) -> None:
+        self._map(*self._pattern())
+
+    def _pattern(self) -> tuple[bytes, np.ndarray]:
+        """Key of the pattern of missing data and switches; the numbers with missing ones read as zero."""
+        d = self.store.numbers
+        square = d @ d
+        if square < np.inf:
+            return (self.program.activity.key(d) if self._switches else b""), d
+        infinite = np.isinf(d)
+        infinite[self._bound_numbers] = False
+        if infinite.any():
+            raise DataError(f"data {self._name_of(int(np.flatnonzero(infinite)[0]))!r} have an infinite value")
+        return self.program.activity.key(d), clean(d)
+
+    def _name_of(self, position: int) -> str:
+        starts = self.layout.data_start
+        return max((start, name) for name, start in starts.items() if start <= position)[1]
+
+    def _map(self, pattern: bytes, numbers: np.ndarray) -> DenseMap | SparseMap:
+        map_ = self._maps.get(pattern)
+        if map_ is None:
+            if len(self._maps) >= MAPS:
+                self._maps.pop(next(iter(self._maps)))
+            map_ = self._maps[pattern] = self._make(pattern, numbers, self.store)
+        return map_
+
+    def _make(self, pattern: bytes, numbers: np.ndarray, store: Any) -> DenseMap | SparseMap:
+        program = self.program
+        flags = program.flags(store.numbers)
+        reduced = program.reduced(numbers)
+        if self._screen and program.dense and not program.eliminated:
+            reduced = reduced.without_equalities()
+        return (DenseMap if program.dense else SparseMap)(program, reduced, store, flags, pattern)
+
+    def _solve(self) -> Solution:
+        pattern, numbers = self._pattern()
+        map_ = self._map(pattern, numbers)
+        if map_.free is not None:
+            if not pattern:
+                require_observable(self.program, map_.free)
+            point = self.layout.identity() if self._point is None else self._point
+            message = "with what is missing, the costs do not determine all unknowns"
+            return Solution(self.layout, point, Status.UNBOUNDED, self.solver, _check(self, numbers, map_, point), 0, message)
+        if self._screen:
+            z, excess = map_(numbers)
+            if not excess.size or excess.max() <= self.options.tolerance:
+                return Solution(self.layout, z, Status.SOLVED, "linear", _check(self, numbers, map_, z))
+        return self._solve_qp(map_, numbers)
+
+    def _solve_qp(self, map_: DenseMap | SparseMap, numbers: np.ndarray) -> Solution:
+        reduced = map_.reduced
+        q = map_.Q @ numbers + map_.q0
+        l, u = reduced.bounds(numbers, map_.flags)
+        result = self._call(map_, q, l, u)
+        status, result = judge(result, map_.P, q, reduced.A, l, u, self.options.tolerance)
+        if result.x is None or result.y is None or not np.isfinite(result.x).all():
+            point = self.layout.identity() if self._point is None else self._point
+            self._last = None
+            return Solution(
+                self.layout, point, status, self.solver, _check(self, numbers, map_, point), result.iterations, result.message
+            )
+        z = reduced.map.Z @ result.x + reduced.map.Y @ numbers + reduced.map.z0
+        self._last = (result.x, result.y)
+        check = _check(self, numbers, map_, z, result.y[reduced.equalities :])
+        return Solution(self.layout, z, status, self.solver, check, result.iterations, result.message)
+
+    def _call(self, map_: DenseMap | SparseMap, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> QPResult:
+        reduced = map_.reduced
+        try:
+            if self._backend is None:
+                self._backend = self._backend_type(map_.P, q, reduced.A, l, u, self.options)
+            elif self._loaded is not map_:
+                self._backend.update(map_.P, reduced.A)
+            self._loaded = map_
+            return self._backend.solve(q, l, u, self._last if self.warm else None)
+        except SettingError:
+            raise
+        except Exception as error:  # a backend that breaks is a status, and the next solve starts afresh
+            self._backend, self._loaded, self._last = None, None, None
+            return QPResult(None, None, Status.FAILED, 0, f"{self.solver} raised {type(error).__name__}: {error}")
+
+    def reset(self) -> None:
+        super().reset()
+        self._last = self._backend = self._loaded = None
+
+    def _forked(self) -> None:
+        self._maps = dict(self._maps)
+        self._backend = self._loaded = None
+
+
+def _check(
+    session: QPSession, numbers: np.ndarray, map_: Any, point: np.ndarray, mu: np.ndarray | None = None
+) -> QPCheck:
+    return QPCheck(session.program, session.store, numbers.copy(), map_.flags, point, mu)
+
+
+def _bound_positions(program: QuadraticProgram) -> np.ndarray:
+    """Positions of data that are bounds and may be infinite."""
+    from problems.problem import DataSlot
+
+    found = [
+        program.layout.numbers(value).ravel()
+        for term in program.problem.terms.values()
+        for value in (term.lower, term.upper)
+        if isinstance(value, DataSlot)
+    ]
+    return np.concatenate(found) if found else np.zeros(0, np.intp)
+
+
