@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from problems.errors import DataError, SettingError
-from problems.forms.layout import INFINITE
-from problems.forms.quadratic import QuadraticProgram, Reduced, clean
+from problems.forms.affine_marginal import AffineMarginal
+from problems.forms.marginal import Marginal
+from problems.forms.quadratic import QuadraticProgram, clean
+from problems.problem import DataSlot, Slot
 from problems.solvers.base import Options, QPBackend, QPResult, Status
 from problems.solvers.qp_check import judge
 from problems.solvers.qp_maps import DenseMap, SparseMap, require_observable
@@ -52,7 +54,7 @@ class QPSession(Session):
         self._switches = program.activity.switches.size > 0
         self._bound_numbers = _bound_positions(program)
         self._maps: dict[bytes, DenseMap | SparseMap] = {}
-        self._work: dict[int, Reduced] = {}
+        self._marginals: dict[Any, AffineMarginal] = {}
         self._backend: QPBackend | None = None
         self._loaded: DenseMap | SparseMap | None = None
         self._last: tuple[np.ndarray, np.ndarray] | None = None
@@ -78,7 +80,7 @@ class QPSession(Session):
         before = self.store[name].tobytes()
         self.store.set(name, value)
         if self.store[name].tobytes() != before:
-            self._maps = {}
+            self._maps, self._marginals = {}, {}
 
     def _update(self) -> None:
         self._map(*self._pattern())
@@ -123,12 +125,25 @@ class QPSession(Session):
                 require_observable(self.program, map_.free)
             point = self.layout.identity() if self._point is None else self._point
             message = "with what is missing, the costs do not determine all unknowns"
-            return Solution(self.layout, point, Status.UNBOUNDED, self.solver, _check(self, numbers, map_, point), 0, message)
+            return Solution(
+                self.layout, point, Status.UNBOUNDED, self.solver, _check(self, numbers, map_, point), 0, message
+            )
         if self._screen:
             z, excess = map_(numbers)
             if not excess.size or excess.max() <= self.options.tolerance:
                 return Solution(self.layout, z, Status.SOLVED, "linear", _check(self, numbers, map_, z))
         return self._solve_qp(map_, numbers)
+
+    def _marginal(self, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
+        """Affine in the data, so the map is kept beside the solution's and costs one product."""
+        pattern, numbers = self._pattern()
+        key = (pattern, _slot_key(drop), _slot_key(keep))
+        found = self._marginals.get(key)
+        if found is None:
+            if len(self._marginals) >= MAPS:
+                self._marginals.pop(next(iter(self._marginals)))
+            found = self._marginals[key] = AffineMarginal(self.program, self.store, numbers, drop, keep)
+        return found(numbers, point)
 
     def _solve_qp(self, map_: DenseMap | SparseMap, numbers: np.ndarray) -> Solution:
         reduced = map_.reduced
@@ -140,7 +155,13 @@ class QPSession(Session):
             point = self.layout.identity() if self._point is None else self._point
             self._last = None
             return Solution(
-                self.layout, point, status, self.solver, _check(self, numbers, map_, point), result.iterations, result.message
+                self.layout,
+                point,
+                status,
+                self.solver,
+                _check(self, numbers, map_, point),
+                result.iterations,
+                result.message,
             )
         z = reduced.map.Z @ result.x + reduced.map.Y @ numbers + reduced.map.z0
         self._last = (result.x, result.y)
@@ -167,7 +188,7 @@ class QPSession(Session):
         self._last = self._backend = self._loaded = None
 
     def _forked(self) -> None:
-        self._maps = dict(self._maps)
+        self._maps, self._marginals = dict(self._maps), dict(self._marginals)
         self._backend = self._loaded = None
 
 
@@ -177,10 +198,15 @@ def _check(
     return QPCheck(session.program, session.store, numbers.copy(), map_.flags, point, mu)
 
 
+def _slot_key(chosen: Any) -> Any:
+    """Identity of slots; index arrays count by their content."""
+    if isinstance(chosen, (tuple, list)):
+        return tuple(_slot_key(entry) for entry in chosen)
+    return (id(chosen.source), chosen.indices.tobytes()) if isinstance(chosen, Slot) else id(chosen)
+
+
 def _bound_positions(program: QuadraticProgram) -> np.ndarray:
     """Positions of data that are bounds and may be infinite."""
-    from problems.problem import DataSlot
-
     found = [
         program.layout.numbers(value).ravel()
         for term in program.problem.terms.values()
@@ -188,5 +214,3 @@ def _bound_positions(program: QuadraticProgram) -> np.ndarray:
         if isinstance(value, DataSlot)
     ]
     return np.concatenate(found) if found else np.zeros(0, np.intp)
-
-

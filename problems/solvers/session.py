@@ -185,18 +185,30 @@ class Session(ABC):
         """Forget the warm start; data and everything compiled stay."""
         self._point = None
 
-    def marginal(self, drop: Any, at: Mapping[str, Any] | None = None) -> Marginal:
+    def marginal(self, drop: Any, keep: Any = None, at: Mapping[str, Any] | None = None) -> Marginal:
         """Integrate out `drop` (variables or slots) with every cost and equality that touches it.
 
-        Returns the information on the other unknowns these terms touch, linearized at the last solution or `at`:
-        exactly the data of an arrival cost (design section 3.3).
-        """
-        from problems.forms.marginal import marginal
+        Args:
+            keep: slots of the result, in its order; by default all instances that share a term with a dropped one.
+            at: values to linearize at; by default the last solution.
 
+        Returns:
+            The information on the kept instances: exactly the data of an arrival cost (design section 3.3).
+
+        Raises:
+            DataError: there is no point to linearize at.
+            DefinitionError: `keep` misses an instance that shares a term with a dropped one.
+            UnobservableError: the terms leave a dropped unknown free.
+        """
         point = self._point if at is None else self.layout.point(at, self._point)
         if point is None:
             raise DataError("marginal needs a point: solve first or give values in `at`")
-        return marginal(self.problem, self.layout, self.store, drop, point)
+        return self._marginal(drop, keep, point)
+
+    def _marginal(self, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
+        from problems.forms.marginal import marginal
+
+        return marginal(self.problem, self.layout, self.store, drop, keep, point)
 
     def _set(self, name: str, value: Any) -> None:
         self.store.set(name, value)
