@@ -1,0 +1,73 @@
+"""`Estimate`, what every estimator returns from a step, and `Estimator`, what it must offer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from problems.solvers.base import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What an estimator knows after one step.
+
+    Attributes:
+        state: estimate (n,) of the newest state.
+        covariance: its covariance (n, n), or None where the estimator has none.
+        window: estimates (length, n) of the states of the window, the newest last; None for filters.
+        status: outcome of the step; unless it is ``solved`` or ``inaccurate``, `state` is the best value left, usually
+            the prediction.
+        seconds: wall time of the step.
+        infeasible: names of the constraints that could not be met.
+        missing: components of the measurement that were not there.
+        late: times (s) of the measurements that came after their own instant and were used in this step.
+        time: time (s) of `state`.
+        state_names: n names.
+    """
+
+    state: np.ndarray
+    covariance: np.ndarray | None
+    window: np.ndarray | None
+    status: Status
+    seconds: float
+    infeasible: tuple[str, ...]
+    missing: tuple[int, ...]
+    late: tuple[float, ...]
+    time: float
+    state_names: tuple[str, ...]
+
+    def to_pandas(self) -> pd.DataFrame:
+        """One row, to be concatenated over steps: `time` (index), states by name, ``sigma_<name>``, status, seconds."""
+        import pandas as pd
+
+        row: dict[str, Any] = dict(zip(self.state_names, self.state.tolist(), strict=True))
+        if self.covariance is not None:
+            sigmas = np.sqrt(np.diag(self.covariance)).tolist()
+            row |= {f"sigma_{name}": sigma for name, sigma in zip(self.state_names, sigmas, strict=True)}
+        row |= {"status": str(self.status), "seconds": self.seconds}
+        return pd.DataFrame([row], index=pd.Index([self.time], name="time"))
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """Estimates the state of one model from one measurement per instant."""
+
+    def step(self, measurements: Any, inputs: Any = None, time: float | None = None) -> Estimate:
+        """Take the measurement of the next instant.
+
+        Args:
+            measurements: y_t (p,), NaN where a component is missing; None where all are.
+            inputs: u_{t-1} (m,), which acted since the previous instant.
+            time: of the measurement (s); the model's sampling time is counted on from the last one if None.
+        """
+        ...
+
+    def reset(self) -> None:
+        """Forget everything but the prior: the next step is the first one."""
+        ...
