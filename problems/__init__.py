@@ -1,6 +1,7 @@
 """State an estimation problem once, in symbols; solve it as a QP, a nonlinear program or a factor graph."""
 
 from problems.errors import HorizonetError
+from problems.models import LinearModel, NonlinearModel, Sensor, simulate
 from problems.noise import L2, Cauchy, Gaussian, GemanMcClure, Huber, Tukey
 from problems.problem import Problem
 from problems.spaces import SE2, SO2, Pose2, Rotation2, Vector, wrap
@@ -14,10 +15,14 @@ __all__ = [
     "GemanMcClure",
     "HorizonetError",
     "Huber",
+    "LinearModel",
+    "NonlinearModel",
     "Pose2",
     "Problem",
     "Rotation2",
+    "Sensor",
     "Tukey",
     "Vector",
+    "simulate",
     "wrap",
 ]

@@ -67,6 +67,12 @@ class DenseMap:
         out += self.t
         return out[: self.size], out[self.size :]
 
+    def many(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for many rows of numbers (count, data): (count, n) and (count, bounds)."""
+        out = numbers @ self.T.T
+        out += self.t
+        return out[:, : self.size], out[:, self.size :]
+
 
 def _free_direction(H: np.ndarray) -> np.ndarray | None:
     """A direction that costs nothing, or None where H is positive definite (scale-free test)."""
@@ -115,6 +121,11 @@ class SparseMap:
         l, u = reduced.bounds(numbers, self.flags)
         rows = reduced.A[m:] @ v
         return z, np.concatenate([rows - u[m:], l[m:] - rows])
+
+    def many(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for many rows of numbers."""
+        answers = [self(row) for row in numbers]
+        return np.array([z for z, _ in answers]), np.array([excess for _, excess in answers])
 
 
 def require_observable(program: QuadraticProgram, free: np.ndarray) -> None:

@@ -15,6 +15,7 @@ from problems.forms.affine_marginal import AffineMarginal
 from problems.forms.marginal import Marginal
 from problems.forms.quadratic import QuadraticProgram, clean
 from problems.problem import DataSlot, Slot
+from problems.solvers.batch import QPBatch
 from problems.solvers.base import Options, QPBackend, QPResult, Status
 from problems.solvers.qp_check import judge
 from problems.solvers.qp_maps import DenseMap, SparseMap, require_observable
@@ -48,21 +49,21 @@ class QPSession(Session):
         super().__init__(program.problem, program.layout, solver, options)
         self.program = program
         self.warm = warm
-        self._screen = screen
+        self.screens = screen
         self._backend_type = backend
-        self._slow = frozenset(name for name, speed in program.speeds.items() if speed != "vector")
+        self.slow = frozenset(name for name, speed in program.speeds.items() if speed != "vector")
         self._switches = program.activity.switches.size > 0
         self._bound_numbers = _bound_positions(program)
         self._maps: dict[bytes, DenseMap | SparseMap] = {}
         self._marginals: dict[Any, AffineMarginal] = {}
         self._backend: QPBackend | None = None
         self._loaded: DenseMap | SparseMap | None = None
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self.last: tuple[np.ndarray, np.ndarray] | None = None
         self._check_without_data()
 
     def _check_without_data(self) -> None:
         """What can be seen before any data: unknowns that no cost sees."""
-        needed = [n for n in self._slow if not self.store.given[n]]
+        needed = [n for n in self.slow if not self.store.given[n]]
         if needed:
             return
         numbers = clean(self.store.numbers)
@@ -74,7 +75,7 @@ class QPSession(Session):
             self._maps[b""] = map_
 
     def _set(self, name: str, value: Any) -> None:
-        if name not in self._slow:
+        if name not in self.slow:
             self.store.set(name, value)
             return
         before = self.store[name].tobytes()
@@ -113,7 +114,7 @@ class QPSession(Session):
         program = self.program
         flags = program.flags(store.numbers)
         reduced = program.reduced(numbers)
-        if self._screen and program.dense and not program.eliminated:
+        if self.screens and program.dense and not program.eliminated:
             reduced = reduced.without_equalities()
         return (DenseMap if program.dense else SparseMap)(program, reduced, store, flags, pattern)
 
@@ -128,7 +129,7 @@ class QPSession(Session):
             return Solution(
                 self.layout, point, Status.UNBOUNDED, self.solver, _check(self, numbers, map_, point), 0, message
             )
-        if self._screen:
+        if self.screens:
             z, excess = map_(numbers)
             if not excess.size or excess.max() <= self.options.tolerance:
                 return Solution(self.layout, z, Status.SOLVED, "linear", _check(self, numbers, map_, z))
@@ -145,6 +146,26 @@ class QPSession(Session):
             found = self._marginals[key] = AffineMarginal(self.program, self.store, numbers, drop, keep)
         return found(numbers, point)
 
+    def batch(self, count: int) -> QPBatch:
+        return QPBatch(self, count)
+
+    def adopt(self, numbers: np.ndarray, same_map: bool = False) -> None:
+        """Take all data at once, as laid out; `same_map` promises equal weights, matrices and pattern."""
+        self.store.numbers[:] = numbers
+        self.store.given = dict.fromkeys(self.store.given, True)
+        if not same_map:
+            self._maps, self._marginals = {}, {}
+
+    def current_map(self) -> DenseMap | SparseMap:
+        """The affine map for the data given so far."""
+        return self._map(*self._pattern())
+
+    def solve_screened_out(self) -> Solution:
+        """Solve by the backend, for data whose affine answer is known to violate a row."""
+        pattern, numbers = self._pattern()
+        map_ = self._map(pattern, numbers)
+        return self._solve() if map_.free is not None else self._solve_qp(map_, numbers)
+
     def _solve_qp(self, map_: DenseMap | SparseMap, numbers: np.ndarray) -> Solution:
         reduced = map_.reduced
         q = map_.Q @ numbers + map_.q0
@@ -153,7 +174,7 @@ class QPSession(Session):
         status, result = judge(result, map_.P, q, reduced.A, l, u, self.options.tolerance)
         if result.x is None or result.y is None or not np.isfinite(result.x).all():
             point = self.layout.identity() if self._point is None else self._point
-            self._last = None
+            self.last = None
             return Solution(
                 self.layout,
                 point,
@@ -164,7 +185,7 @@ class QPSession(Session):
                 result.message,
             )
         z = reduced.map.Z @ result.x + reduced.map.Y @ numbers + reduced.map.z0
-        self._last = (result.x, result.y)
+        self.last = (result.x, result.y)
         check = _check(self, numbers, map_, z, result.y[reduced.equalities :])
         return Solution(self.layout, z, status, self.solver, check, result.iterations, result.message)
 
@@ -176,16 +197,16 @@ class QPSession(Session):
             elif self._loaded is not map_:
                 self._backend.update(map_.P, reduced.A)
             self._loaded = map_
-            return self._backend.solve(q, l, u, self._last if self.warm else None)
+            return self._backend.solve(q, l, u, self.last if self.warm else None)
         except SettingError:
             raise
         except Exception as error:  # a backend that breaks is a status, and the next solve starts afresh
-            self._backend, self._loaded, self._last = None, None, None
+            self._backend, self._loaded, self.last = None, None, None
             return QPResult(None, None, Status.FAILED, 0, f"{self.solver} raised {type(error).__name__}: {error}")
 
     def reset(self) -> None:
         super().reset()
-        self._last = self._backend = self._loaded = None
+        self.last = self._backend = self._loaded = None
 
     def _forked(self) -> None:
         self._maps, self._marginals = dict(self._maps), dict(self._marginals)

@@ -18,6 +18,7 @@ from problems.forms.layout import DataStore, Layout
 from problems.solvers.base import Options, Status
 
 if TYPE_CHECKING:
+    from problems.solvers.batch import BatchSession
     from problems.forms.marginal import Marginal
     from problems.problem import Problem, Slot, Variable
 
@@ -180,6 +181,12 @@ class Session(ABC):
         other._point = None if self._point is None else self._point.copy()
         other._forked()
         return other
+
+    def batch(self, count: int) -> BatchSession:
+        """The same session on a leading axis of `count` entries, for networks and Monte Carlo trials."""
+        from problems.solvers.batch import ForkBatch
+
+        return ForkBatch(self, count)
 
     def reset(self) -> None:
         """Forget the warm start; data and everything compiled stay."""
