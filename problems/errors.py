@@ -92,6 +92,14 @@ class ReadError(HorizonetError, ValueError):
         super().__init__(f"{where}: expected {expected}{got}")
 
 
+class WriteError(HorizonetError, OSError):
+    """An output file or folder cannot be written."""
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        self.path, self.reason = Path(path), reason
+        super().__init__(f"cannot write to {path}: {reason}")
+
+
 class HorizonetWarning(UserWarning):
     """Base of all warnings of this project."""
 

@@ -1,0 +1,1 @@
+"""The command `horizonet`, one file for each of its commands."""

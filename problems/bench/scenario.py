@@ -1,0 +1,96 @@
+"""What a scenario is: the world an estimator is tried in, with the methods that can be tried there."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import pydantic
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass
+class Outcome:
+    """What one method did in one trial.
+
+    Attributes:
+        metrics: value by metric name; None where the metric has no value in this trial (never converged, no truth).
+        options: the set of options the method stands for, by name, as printed beside the result.
+        times: seconds by part, among `TIMES`. `compile` is what compiling cost in this process, also when an earlier
+            trial paid for it.
+        step_seconds: (steps,) wall time of each estimation step.
+        status: steps by status name (`problems.solvers.base.Status`).
+        iterations: solver iterations of all steps.
+        residual: the worst residual the sessions recomputed; None where nothing was solved.
+        trace: whatever the scenario's own plot needs; must be picklable.
+    """
+
+    metrics: Mapping[str, float | None]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    times: Mapping[str, float] = field(default_factory=dict)
+    step_seconds: np.ndarray = field(default_factory=lambda: np.empty(0))
+    status: Counter[str] = field(default_factory=Counter)
+    iterations: int = 0
+    residual: float | None = None
+    trace: Any = None
+
+
+TIMES = ("compile", "setup", "update", "solve")
+
+
+class Scenario(Protocol):
+    """An object registered in the entry-point group ``horizonet.scenarios``.
+
+    Attributes:
+        name: the registered name.
+        source: where the numbers of the scenario come from.
+        methods: names `run` takes; the first one is the baseline of paired differences.
+        metrics: names of the metrics, the main one first. Smaller is better unless the source says otherwise.
+        settings: pydantic model with defaults, validation and ``extra="forbid"``.
+
+    A scenario with methods that solve no optimization problem (a Kalman filter) also has ``without_solver``, a tuple
+    of their names; a plan then gives them one row instead of one for each solver.
+    """
+
+    name: str
+    source: str
+    methods: tuple[str, ...]
+    metrics: tuple[str, ...]
+    settings: type[pydantic.BaseModel]
+
+    def draw(self, settings: Any, rng: np.random.Generator) -> Any:
+        """Truth and noise of one trial, all that is random in it; `run` leaves it as it is, for others share it."""
+        ...
+
+    def run(self, settings: Any, method: str, solver: str, drawn: Any) -> Outcome:
+        """Run one method with one solver on what was drawn, starting from fresh sessions."""
+        ...
+
+    def plot(self, settings: Any, drawn: Any, outcomes: Mapping[str, Outcome]) -> Figure:
+        """Picture of one trial with the outcomes by label."""
+        ...
+
+
+NO_SOLVER = "none"
+
+
+def takes_solver(scenario: Scenario, method: str) -> bool:
+    """Whether the method solves an optimization problem, so that the choice of a solver means something."""
+    return method not in getattr(scenario, "without_solver", ())
+
+
+def trial_rng(seed: int, scenario: str, trial: int) -> np.random.Generator:
+    """The generator of one trial.
+
+    It depends on nothing else: methods, solvers and settings of a trial meet the same noise, so their differences are
+    paired. Settings that change what is drawn do so through `Scenario.draw`.
+    """
+    digest = hashlib.sha256(scenario.encode()).digest()
+    words = np.frombuffer(digest[:16], dtype="<u4").tolist()
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*words, trial)))
