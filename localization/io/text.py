@@ -81,8 +81,7 @@ class Rows:
             missing: whether NaN or an empty field may stand for a missing number.
 
         Raises:
-            ReadError: another count of numbers, something that is no number, infinity or absurdly large, or a NaN that is
-                not allowed.
+            ReadError: another count of numbers, no number, one beyond `LARGEST_NUMBER`, or a NaN not allowed.
         """
         if not self.texts:
             return np.zeros((0, columns))
