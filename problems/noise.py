@@ -26,7 +26,8 @@ class Gaussian:
         covariance: (dim, dim) or (count, dim, dim), symmetric positive definite.
         information: inverse covariance, same shapes; positive semidefinite (a zero block means "nothing known").
 
-    Each may also be a data handle of the problem, so that the numbers change from solve to solve.
+    Each may also be a data handle of the problem, so that the numbers change from solve to solve; sigma data may be one
+    number per instance for all its components.
 
     Raises:
         NoiseError: none or several of the three given.
@@ -80,8 +81,15 @@ def information_matrix(kind: Kind, value: Any, dim: int, count: int, what: str) 
     return np.linalg.inv(array)
 
 
+def _array(value: Any, kind: Kind, what: str) -> np.ndarray:
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise NoiseError(f"{what}: {kind} must be numbers, got {value!r}") from None
+
+
 def _sigmas(value: Any, dim: int, count: int, what: str) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
+    array = _array(value, "sigma", what)
     if array.ndim == 0 or array.size == 1:
         array = np.full((1, dim), float(array.ravel()[0]))
     elif array.shape == (dim,):
@@ -98,7 +106,7 @@ def _sigmas(value: Any, dim: int, count: int, what: str) -> np.ndarray:
 
 
 def _matrices(kind: Kind, value: Any, dim: int, count: int, what: str) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
+    array = _array(value, kind, what)
     if dim == 1 and array.size in (1, count):
         array = array.reshape(-1, 1, 1)
     elif array.shape == (dim, dim):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from problems.errors import DefinitionError, NoiseError, ShapeError
-from problems.noise import Gaussian, L2, Loss, whitening
+from problems.noise import L2, Gaussian, Loss
 from problems.spaces import Space
 
 if TYPE_CHECKING:
@@ -166,9 +166,7 @@ class Problem:
         """
         self._free(name)
         if not isinstance(space, Space) or isinstance(space, type):
-            raise DefinitionError(
-                f"variables {name!r}: expected a space such as Vector(3), SO2 or SE2, got {space!r}"
-            )
+            raise DefinitionError(f"variables {name!r}: expected a space such as Vector(3), SO2 or SE2, got {space!r}")
         self.unknowns[name] = Variable(self, name, space, _count(count, f"variables {name!r}"))
         return self.unknowns[name]
 
@@ -211,7 +209,7 @@ class Problem:
         self._own(data, "presence")
         name = f"presence({data.name})"
         if name not in self.inputs:
-            self.inputs[name] = Data(self, name, (), data.count, np.ones((data.rows, 1)), of=data)
+            self.inputs[name] = Data(self, name, (), data.count, of=data)
         return self.inputs[name]
 
     def cost(
@@ -249,15 +247,11 @@ class Problem:
         if linear is not None and not isinstance(loss, L2):
             raise DefinitionError(f"cost {name!r}: a linear part has no meaning under the loss {loss!r}")
         term = self._term("cost", name, residual, on, data, noise=noise, loss=loss, linear=linear, active=active)
-        dim = self._dimension(term)
-        if not isinstance(noise.value, (Data, DataSlot)):
-            whitening(noise.kind, noise.value, dim, term.count, term.what)
         return self._add(term)
 
     def equality(self, name: str, residual: Callable[..., Any], on: Any, data: Any = ()) -> Term:
         """Require ``r = 0`` of every instance. Arguments and errors as for `cost`."""
         term = self._term("equality", name, residual, on, data)
-        self._dimension(term)
         return self._add(term)
 
     def inequality(
@@ -281,10 +275,6 @@ class Problem:
             EmptyConstraintError: constant bounds that cross.
         """
         term = self._term("inequality", name, residual, on, data, lower=lower, upper=upper, active=active)
-        dim = self._dimension(term)
-        from problems.forms.layout import check_bounds
-
-        check_bounds(term, dim)
         return self._add(term)
 
     def compile(
@@ -320,9 +310,7 @@ class Problem:
         counts.discard(1)
         if len(counts) > 1:
             sizes = ", ".join(f"{s.source.name}: {len(s.indices)}" for s in slots + rows)
-            raise ShapeError(
-                f"{what}: slots and data must have one instance (repeated) or a common count; got {sizes}"
-            )
+            raise ShapeError(f"{what}: slots and data must have one instance (repeated) or a common count; got {sizes}")
         for key in ("linear", "lower", "upper", "active"):
             if isinstance(parts.get(key), (Data, DataSlot)):
                 parts[key] = self._data_slot(parts[key], what)
@@ -331,12 +319,11 @@ class Problem:
             parts["noise"] = Gaussian(**{noise.kind: self._data_slot(noise.value, what)})
         return Term(kind, name, residual, slots, rows, counts.pop() if counts else 1, **parts)
 
-    def _dimension(self, term: Term) -> int:
+    def _add(self, term: Term) -> Term:
+        from problems.forms.layout import check_numbers
         from problems.forms.template import template_of
 
-        return template_of(term).dim
-
-    def _add(self, term: Term) -> Term:
+        check_numbers(term, template_of(term).dim)
         self.terms[term.name] = term
         return term
 
@@ -356,9 +343,7 @@ class Problem:
 
     def _own(self, entry: Variable | Data, what: str) -> None:
         if entry.problem is not self:
-            raise DefinitionError(
-                f"{what}: {entry!r} belongs to problem {entry.problem.name!r}, not to {self.name!r}"
-            )
+            raise DefinitionError(f"{what}: {entry!r} belongs to problem {entry.problem.name!r}, not to {self.name!r}")
 
     def _free(self, name: str) -> None:
         if not isinstance(name, str) or not name:

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from problems.errors import FormError, NotAffineError
-from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows
+from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, noise_numbers
 from problems.forms.residual_code import ArrayCode
 from problems.forms.template import Template, template_of
 from problems.noise import L2, information_matrix
@@ -78,9 +78,7 @@ class _AffineCode:
         zeros = [*template.x, *vectors]
         v = ca.vertcat(*vectors) if vectors else ca.SX(0, 1)
         E = ca.jacobian(template.residual, v)
-        c = ca.substitute(
-            [template.residual, template.jacobian, E], zeros, [ca.SX.zeros(z.shape) for z in zeros]
-        )
+        c = ca.substitute([template.residual, template.jacobian, E], zeros, [ca.SX.zeros(z.shape) for z in zeros])
         self.dim, self.width, self.reads = template.dim, template.width, v.shape[0]
         inputs = ca.vertcat(*slow) if slow else ca.SX(0, 1)
         self.constant = not slow
@@ -207,12 +205,7 @@ def information_of(rows: Rows, store: DataStore, on: np.ndarray | None) -> np.nd
     """Information matrices (count, dim, dim) of a cost term, zero for instances that are off."""
     term = rows.layout.term
     assert term.noise is not None
-    value = term.noise.value
-    if isinstance(value, DataSlot):
-        shape = value.source.shape
-        value = store[value.source.name][value.indices].reshape(len(value.indices), *shape)
-        if len(shape) < (1 if term.noise.kind == "sigma" else 2):
-            value = value[:, None] if term.noise.kind == "sigma" else value
+    value = noise_numbers(term, rows.dim, store)
     W = information_matrix(term.noise.kind, value, rows.dim, term.count, term.what)
     if on is None:
         return W

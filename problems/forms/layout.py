@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from problems.errors import DataError, EmptyConstraintError, ShapeError, UnknownNameError
+from problems.noise import whitening
 from problems.problem import Data, DataSlot, Problem, Slot, Term
 from problems.spaces import points
 
@@ -41,32 +42,79 @@ def data_rows(entry: Data, value: Any) -> np.ndarray:
     raise ShapeError(f"data {entry.name!r}: expected shape {expected}, got {array.shape}")
 
 
-def check_bounds(term: Term, dim: int) -> None:
-    """Constant bounds of an inequality: shapes, NaN, crossing."""
+def check_numbers(term: Term, dim: int) -> None:
+    """Weights, linear part, bounds and flags of a term with residuals of `dim` rows: shapes, NaN, crossing bounds.
+
+    Raises:
+        ShapeError, NoiseError, DataError, EmptyConstraintError: naming the term and what does not fit.
+    """
+    noise = term.noise
+    if noise is not None and isinstance(noise.value, DataSlot):
+        single = noise.kind == "sigma" or dim == 1
+        allowed = {(dim,) if noise.kind == "sigma" else (dim, dim)} | ({(), (1,)} if single else set())
+        _check_slot(noise.value, allowed, term, noise.kind)
+    elif noise is not None:
+        whitening(noise.kind, noise.value, dim, term.count, term.what)
     given = {}
-    for key in ("lower", "upper"):
+    for key, size in (("linear", dim), ("lower", dim), ("upper", dim), ("active", 1)):
         value = getattr(term, key)
-        if not isinstance(value, DataSlot):
-            given[key] = constant_rows(value, dim, term.count, f"{term.what}: {key}")
-            if np.isnan(given[key]).any():
-                raise DataError(f"{term.what}: {key} has a NaN; leave a bound out with an infinity")
-    if len(given) == 2 and (given["lower"] > given["upper"]).any():
-        row, part = np.argwhere(given["lower"] > given["upper"])[0]
-        raise EmptyConstraintError(
-            f"{term.what}: no point satisfies instance {row}, row {part}: lower "
-            f"{given['lower'][row, part]:g} is above upper {given['upper'][row, part]:g}"
-        )
+        if isinstance(value, DataSlot):
+            _check_slot(value, {(), (1,), (size,)}, term, key)
+        elif value is not None:
+            given[key] = constant_rows(value, size, term.count, f"{term.what}: {key}")
+            finite = ~np.isnan(given[key]) if key in ("lower", "upper") else np.isfinite(given[key])
+            if not finite.all():
+                hint = "; leave a bound out with an infinity" if key in ("lower", "upper") else ""
+                raise DataError(f"{term.what}: instance {_first(~finite)} of {key} is not a number one can use{hint}")
+    if "lower" in given and "upper" in given:
+        # no number lies above an infinite lower bound or below an infinite upper one
+        crossed = (given["lower"] > given["upper"]) | (given["lower"] == np.inf) | (given["upper"] == -np.inf)
+        if crossed.any():
+            row, part = np.argwhere(crossed)[0]
+            raise EmptyConstraintError(
+                f"{term.what}: no point satisfies instance {row}, row {part}: lower "
+                f"{given['lower'][row, part]:g} is above upper {given['upper'][row, part]:g}"
+            )
+
+
+def noise_numbers(term: Term, dim: int, store: DataStore) -> Any:
+    """The numbers of a term's noise model as `problems.noise` takes them: instances first where they are data."""
+    assert term.noise is not None
+    value = term.noise.value
+    if not isinstance(value, DataSlot):
+        return value
+    rows = store[value.source.name][value.indices]
+    if term.noise.kind == "sigma":
+        return np.broadcast_to(rows, (rows.shape[0], dim))
+    return rows.reshape(-1, dim, dim)
+
+
+def _check_slot(slot: DataSlot, allowed: set[tuple[int, ...]], term: Term, key: str) -> None:
+    source, rows = slot.source, len(slot.indices)
+    if source.shape not in allowed:
+        shapes = " or ".join(str(shape) for shape in sorted(allowed))
+        raise ShapeError(f"{term.what}: {key} needs data with rows of shape {shapes}, got {source!r}")
+    if rows not in (1, term.count):
+        raise ShapeError(f"{term.what}: {key} needs data with 1 or {term.count} row(s), got {rows} of {source!r}")
+
+
+def _first(bad: np.ndarray) -> int:
+    return int(np.flatnonzero(bad.any(axis=1))[0])
 
 
 def constant_rows(value: Any, dim: int, count: int, what: str) -> np.ndarray:
     """A number, (dim,), (count,) for dim 1, or (count, dim) as (count, dim)."""
-    array = np.asarray(value, dtype=float)
+    expected = f"{what} must be a number, ({dim},) or ({count}, {dim})"
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ShapeError(f"{expected}; got {value!r}") from None
     if array.shape == (count,) and dim == 1:
         array = array[:, None]
     try:
         return np.broadcast_to(array, (count, dim))
     except ValueError:
-        raise ShapeError(f"{what} must be a number, ({dim},) or ({count}, {dim}); got shape {array.shape}") from None
+        raise ShapeError(f"{expected}; got shape {array.shape}") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +223,7 @@ class Layout:
     def value(self, point: np.ndarray, name: str) -> np.ndarray:
         variable = self.problem.unknowns[name]
         start, ambient = self.stored_start[name], variable.space.ambient
-        return point[..., start : start + variable.count * ambient].reshape(
-            *point.shape[:-1], variable.count, ambient
-        )
+        return point[..., start : start + variable.count * ambient].reshape(*point.shape[:-1], variable.count, ambient)
 
     def retract(self, point: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The point moved by a tangent step."""
@@ -199,11 +245,15 @@ class DataStore:
         self.numbers = np.full(layout.data_size, np.nan)
         self.given = {name: False for name in layout.problem.inputs}
         self._views: dict[str, np.ndarray] = {}
-        self._flags = {d.of.name: d.name for d in layout.problem.inputs.values() if d.of is not None}
-        for name, entry in layout.problem.inputs.items():
+        inputs = layout.problem.inputs
+        self._flags = {d.of.name: d.name for d in inputs.values() if d.of is not None}
+        for name, entry in inputs.items():
             start = layout.data_start[name]
             self._views[name] = self.numbers[start : start + entry.rows * entry.size].reshape(entry.rows, entry.size)
-            if entry.value is not None:
+            if entry.of is not None:
+                self._views[name][...], self.given[name] = 1.0, True
+        for name, entry in inputs.items():
+            if entry.of is None and entry.value is not None:
                 self.set(name, entry.value)
 
     def copy(self, numbers: np.ndarray | None = None) -> DataStore:
@@ -214,11 +264,11 @@ class DataStore:
         return other
 
     def set(self, name: str, value: Any) -> None:
-        """Take new numbers. Raises UnknownNameError or ShapeError."""
+        """Take new numbers. Raises UnknownNameError, ShapeError or DataError."""
         view = self._views.get(name)
-        if view is None:
-            raise UnknownNameError("data", name, [n for n in self._views if not n.startswith("presence(")])
-        if type(value) is np.ndarray and value.shape == view.shape:
+        if view is None or name in self._flags.values():
+            raise UnknownNameError("data", name, [n for n in self._views if n not in self._flags.values()])
+        if type(value) is np.ndarray and value.shape == view.shape and value.dtype == float:
             view[...] = value
         else:
             view[...] = data_rows(self.layout.problem.inputs[name], value)
@@ -234,9 +284,7 @@ class DataStore:
         """Raises DataError naming data that were never given."""
         missing = [name for name, given in self.given.items() if not given]
         if missing:
-            raise DataError(
-                f"data never given and without default: {', '.join(missing)}; pass them to solve or update"
-            )
+            raise DataError(f"data never given and without default: {', '.join(missing)}; pass them to solve or update")
 
 
 class Activity:
@@ -248,9 +296,10 @@ class Activity:
             term = entry.term
             flagged = {s.source.of.name for s in term.data if s.source.of is not None}
             reads = [layout.numbers(s) for s in term.data if s.source.of is None and s.source.name not in flagged]
-            if isinstance(term.linear, DataSlot):
-                reads.append(layout.numbers(term.linear))
-            index = np.hstack([np.broadcast_to(r, (term.count, r.shape[1])) for r in reads] or [np.zeros((term.count, 0), int)])
+            reads += [layout.numbers(v) for v in (term.linear, term.lower, term.upper) if isinstance(v, DataSlot)]
+            index = np.hstack(
+                [np.zeros((term.count, 0), np.intp), *(np.broadcast_to(r, (term.count, r.shape[1])) for r in reads)]
+            )
             switch = None
             if isinstance(term.active, DataSlot):
                 switch = np.broadcast_to(layout.numbers(term.active), (term.count, 1))[:, 0]
@@ -260,7 +309,7 @@ class Activity:
         self.constant = [
             None
             if term.term.active is None or isinstance(term.term.active, DataSlot)
-            else np.broadcast_to(np.asarray(term.term.active, dtype=bool), (term.term.count,))
+            else constant_rows(term.term.active, 1, term.term.count, f"{term.term.what}: active")[:, 0] != 0
             for term, _, _ in self._terms
         ]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from problems.errors import DataError
 from problems.forms.kernels import CostKernel, cost_kernel
-from problems.forms.layout import Activity, DataStore, Layout, TermLayout, constant_rows
+from problems.forms.layout import Activity, DataStore, Layout, TermLayout, constant_rows, noise_numbers
 from problems.forms.residual_code import residual_code
 from problems.forms.sparsity import HessianPattern
 from problems.forms.template import template_of
@@ -27,10 +27,7 @@ def whitening_numbers(entry: TermLayout, dim: int, store: DataStore) -> np.ndarr
     """Whitening of a cost as kernel inputs: (dim or dim(dim+1)/2, 1 or count)."""
     noise = entry.term.noise
     assert noise is not None
-    value = noise.value
-    if isinstance(value, DataSlot):
-        value = store[value.source.name][value.indices].reshape(len(value.indices), *value.source.shape)
-    root = whitening(noise.kind, value, dim, entry.term.count, entry.term.what)
+    root = whitening(noise.kind, noise_numbers(entry.term, dim, store), dim, entry.term.count, entry.term.what)
     if root.ndim == 2:
         return root.T
     a, b = np.triu_indices(dim)
@@ -327,9 +324,6 @@ class Constraints:
 
 def _bound_numbers(layout: Layout) -> np.ndarray:
     found = [
-        layout.numbers(v).ravel()
-        for e in layout.terms
-        for v in (e.term.lower, e.term.upper)
-        if isinstance(v, DataSlot)
+        layout.numbers(v).ravel() for e in layout.terms for v in (e.term.lower, e.term.upper) if isinstance(v, DataSlot)
     ]
     return np.concatenate(found) if found else np.zeros(0, np.intp)

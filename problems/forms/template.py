@@ -60,10 +60,7 @@ class Template:
     @property
     def nonlinear_data(self) -> tuple[bool, ...]:
         """For each datum: does it multiply a variable or enter nonlinearly on its own?"""
-        return tuple(
-            bool(ca.depends_on(self.jacobian, d) or ca.depends_on(ca.jacobian(self.residual, d), d))
-            for d in self.data
-        )
+        return tuple(bool(ca.depends_on(self.jacobian, d) or not is_affine_in(self.residual, d)) for d in self.data)
 
     @property
     def products(self) -> tuple[tuple[int, int], ...]:
@@ -85,15 +82,19 @@ def template_of(term: Term) -> Template:
     spaces = tuple(slot.source.space for slot in term.slots)
     shapes = tuple(slot.source.shape for slot in term.data)
     try:
+        hash(term.residual)
+    except TypeError:
+        raise DefinitionError(
+            f"{term.what}: the residual {term.residual!r} must be hashable, as functions are"
+        ) from None
+    try:
         return _template(term.residual, spaces, shapes)
     except (DefinitionError, ShapeError) as error:
         raise type(error)(f"{term.what}: {error}") from error.__cause__
 
 
 @lru_cache(maxsize=1024)
-def _template(
-    residual: Callable[..., Any], spaces: tuple[Space, ...], shapes: tuple[tuple[int, ...], ...]
-) -> Template:
+def _template(residual: Callable[..., Any], spaces: tuple[Space, ...], shapes: tuple[tuple[int, ...], ...]) -> Template:
     x = tuple(ca.SX.sym(f"x{i}", space.ambient) for i, space in enumerate(spaces))
     d = tuple(ca.SX.sym(f"d{i}", int(np.prod(shape, dtype=int))) for i, shape in enumerate(shapes))
     elements = [space.element(xi) for space, xi in zip(spaces, x, strict=True)]
@@ -104,8 +105,32 @@ def _template(
     if free:
         raise DefinitionError(f"the residual contains symbols that are neither slots nor data: {', '.join(free)}")
     jacobian = _tangent_jacobian(r, x, spaces)
-    affine = all(isinstance(space, Vector) for space in spaces) and not ca.depends_on(jacobian, ca.vertcat(*x))
+    affine = all(isinstance(space, Vector) for space in spaces) and is_affine_in(r, ca.vertcat(*x))
     return Template(x, d, r, jacobian, tuple(space.dim for space in spaces), affine)
+
+
+_STEPS = (
+    ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR,
+    ca.OP_FLOOR, ca.OP_CEIL, ca.OP_SIGN, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_COPYSIGN,
+)  # fmt: skip
+
+
+def is_affine_in(expression: ca.SX, symbols: ca.SX) -> bool:
+    """Are the derivatives constant, with no step anywhere (a wrapped angle has derivative 1 and is not affine)?"""
+    if ca.depends_on(ca.jacobian(expression, symbols), symbols):
+        return False
+    others = [s for s in ca.symvar(expression) if not ca.depends_on(symbols, s)]
+    function = ca.Function("walk", [symbols, ca.vertcat(*others)], [expression])
+    depends: dict[int, bool] = {}
+    for k in range(function.n_instructions()):
+        op, reads = function.instruction_id(k), function.instruction_input(k)
+        if op == ca.OP_OUTPUT:
+            continue
+        touched = reads[0] == 0 if op == ca.OP_INPUT else op != ca.OP_CONST and any(depends[r] for r in reads)
+        if touched and (op in _STEPS or (op == ca.OP_IF_ELSE_ZERO and depends[reads[0]])):
+            return False
+        depends[function.instruction_output(k)[0]] = touched
+    return True
 
 
 def _shaped(symbol: ca.SX, shape: tuple[int, ...]) -> ca.SX:
@@ -115,7 +140,7 @@ def _shaped(symbol: ca.SX, shape: tuple[int, ...]) -> ca.SX:
 def _call(residual: Callable[..., Any], elements: list[Any], rows: list[ca.SX]) -> Any:
     name = getattr(residual, "__name__", repr(residual))
     given = ", ".join(
-        [getattr(e, "__class__").__name__ if not isinstance(e, ca.SX) else f"column of {e.shape[0]}" for e in elements]
+        [e.__class__.__name__ if not isinstance(e, ca.SX) else f"column of {e.shape[0]}" for e in elements]
         + [f"data {tuple(r.shape)}" for r in rows]
     )
     try:
