@@ -219,7 +219,8 @@ def fusion_coefficients(weights: Weights, rule: FusionRule = "out_degree") -> We
 
     Args:
         weights: consensus weights k_ij.
-        rule: ``"out_degree"``: d_j k_ij^2, (2.23) with d_j = nodes that hear j (dmhe-pre-estimation 3.3, E1);
+        rule: ``"out_degree"``: d_j k_ij^2, (2.23) with d_j = nodes that hear j (dmhe-pre-estimation 3.3, E1); links of
+            weight 0 count as absent;
             ``"convex"``: k_ij, (4.11) of dmhe-sporadic-fov 3.8;
             ``"in_degree"``: n_S^j k_ij^2, (2.23) as printed; breaks the consensus inequality on unbalanced graphs.
 
@@ -230,7 +231,8 @@ def fusion_coefficients(weights: Weights, rule: FusionRule = "out_degree") -> We
     if rule == "convex":
         return weights
     if rule == "out_degree":
-        return Weights(network, network.out_degree[network.senders] * values**2)
+        listeners = np.bincount(network.senders[values > 0], minlength=network.count)
+        return Weights(network, listeners[network.senders] * values**2)
     if rule == "in_degree":
         return Weights(network, network.in_degree[network.senders] * values**2)
     raise UnknownNameError("fusion rule", rule, get_args(FusionRule))

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
+from problems.errors import SettingError
 from problems.runtime.node import NodeError, NodeFactory
 
 _ANSWER_SECONDS = 300.0
@@ -72,9 +73,19 @@ class ProcessHost:
     Processes come from a fork server (else they are spawned), never from a fork of this process, whose threads and
     locks a child must not inherit. So `make` must be picklable: a function or class of a module, or a
     `functools.partial` of one.
+
+    Raises:
+        SettingError: `make` cannot be pickled.
     """
 
     def __init__(self, make: NodeFactory[Any]) -> None:
+        try:
+            pickle.dumps(make)
+        except Exception as error:
+            raise SettingError(
+                "nodes in processes need a factory that can be pickled: a function or class of a module, or a "
+                f"functools.partial of one ({error})"
+            ) from error
         methods = multiprocessing.get_all_start_methods()
         self._context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
         self._make = make

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
+from pathlib import Path
 
 import networkx as nx
 import numpy as np
@@ -26,6 +29,8 @@ from problems.networks import (
     torus,
     within_radius,
 )
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def as_digraph(network: Network) -> nx.DiGraph:
@@ -224,6 +229,15 @@ def test_random_graphs_have_the_statistics_asked_for_and_repeat() -> None:
     assert (random_regular(20, 3, rng).in_degree == 4).all()
     assert erdos_renyi(50, 0.1, np.random.default_rng(5)) == erdos_renyi(50, 0.1, np.random.default_rng(5))
     assert erdos_renyi(30, 1.0, rng) == random_digraph(30, 1.0, rng) == complete(30)
+
+
+def test_importing_graphs_and_runtime_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, problems.networks, problems.runtime, mhe.observers, mhe.covariance;"
+        "print([m for m in ('scipy', 'networkx', 'pandas', 'gtsam') if m in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    assert found.stdout.strip() == "[]"
 
 
 def test_every_pair_can_be_drawn() -> None:

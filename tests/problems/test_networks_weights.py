@@ -212,6 +212,7 @@ class TestFusion:
         np.testing.assert_allclose(fusion_coefficients(weights).matrix(), squared * [4, 2, 1, 1])
         np.testing.assert_allclose(fusion_coefficients(weights, "in_degree").matrix(), squared * [2, 2, 2, 2])
         np.testing.assert_allclose(fusion_coefficients(weights, "convex").matrix(), weights.matrix())
+        np.testing.assert_allclose(fusion_coefficients(Weights(fan, fan.senders == fan.receivers)).matrix(), np.eye(4))
         with pytest.raises(UnknownNameError, match="out_degree"):
             fusion_coefficients(weights, "out-degree")  # type: ignore[arg-type]
 

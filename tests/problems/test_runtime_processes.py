@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from problems.errors import UnknownNameError
+from problems.errors import SettingError, UnknownNameError
 from problems.networks import Network, uniform_weights
 from problems.runtime import (
     EventSimulation,
@@ -176,6 +176,11 @@ def test_nodes_live_in_different_processes_that_end() -> None:
     for pid in {*first, *third}:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+def test_a_factory_that_cannot_travel_is_refused() -> None:
+    with pytest.raises(SettingError, match="can be pickled"):
+        Simulation(NETWORK, lambda index: FragileNode(index), processes=True)
 
 
 def test_errors_name_the_node_and_the_phase() -> None:
