@@ -25,6 +25,7 @@ from problems.runtime import (
     newest_by_sender,
     random_outages,
 )
+from problems.runtime.trace import Delivery
 
 VALUE = Schema("value", {"value": ()})
 PAIR = Schema("pair", {"value": (), "origin": Field((), "i4")})
@@ -441,6 +442,28 @@ class TestAsynchronous:
             counters = simulation.counters
             assert counters.lost.sum() / counters.messages.sum() == pytest.approx(0.3, abs=0.06)
         assert digests[0] == digests[1] != digests[2]
+
+    def test_fates_of_messages_and_links_are_independent(self) -> None:
+        simulation = EventSimulation(
+            Network(3, [(0, 1), (1, 0)]),
+            partial(TokenNode, bids=(0.0, 0.0, 0.0)),
+            [range(1, 641), range(1, 641), []],
+            links=Links(loss=0.5),
+            rng=np.random.default_rng(4),
+            record=True,
+        )
+        simulation.run(700)
+        assert simulation.trace is not None
+        arrivals = [
+            (entry.receiver, Message.from_bytes(entry[2]).sequence)
+            for entry in simulation.trace.entries
+            if isinstance(entry, Delivery) and entry.arrival is not None
+        ]
+        fates = np.zeros((2, 640))
+        fates[tuple(np.array(arrivals).T)] = 1
+        table = fates.reshape(20, 32)
+        assert np.abs(np.corrcoef(table) - np.eye(20)).max() < 4.5 / np.sqrt(32)
+        assert abs(np.corrcoef(fates)[0, 1]) < 4 / np.sqrt(640)
 
     def test_death_loses_events_and_memory(self) -> None:
         simulation = EventSimulation(
