@@ -77,9 +77,7 @@ def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: s
         except RuntimeError as error:
             raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)") from error
         solved = [-factor.solve(b.toarray() if sp.issparse(b) else b) for b in right]
-        place = sp.csr_array(
-            (np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size)
-        )
+        place = sp.csr_array((np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size))
         stay = sp.csr_array((np.ones(kept.size), (kept, np.arange(kept.size))), shape=(size, kept.size))
         Z = (stay + place @ sp.csr_array(solved[0])).tocsr()
         Y = (place @ sp.csr_array(solved[1])).tocsr()
@@ -98,10 +96,10 @@ def null_space(R: np.ndarray, E: np.ndarray, c: np.ndarray) -> AffineMap:
     if not R.shape[0]:
         return AffineMap.identity(size, E.shape[1], True)
     U, s, Vt = la.svd(R)
-    rank = int((s > 1e-11 * max(s[0], 1.0)).sum())
+    rank = int((s > 1e-11 * s[0]).sum())
     null = U[:, rank:]
-    if rank < R.shape[0] and np.abs(null.T @ np.column_stack([E, c])).max() > 1e-9:
-        if np.abs(null.T @ E).max() <= 1e-9:
+    if np.abs(null.T @ np.column_stack([E, c])).max(initial=0.0) > 1e-9:
+        if np.abs(null.T @ E).max(initial=0.0) <= 1e-9:
             raise EmptyConstraintError("the equalities contradict each other; no point satisfies all of them")
         raise FormError("some equality rows are combinations of others, so they restrict the data; remove them")
     inverse = Vt[:rank].T @ (U[:, :rank] / s[:rank]).T

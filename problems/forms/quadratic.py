@@ -1,7 +1,7 @@
 """`QuadraticProgram`: an affine problem as ``1/2 v'Pv + q'v`` subject to ``l <= A v <= u``, as a function of the data.
 
-P and A change with weight and matrix data only; q, l, u are affine in the vector data. `condense` gives the same problem
-in fewer unknowns (windows F1, F2, F3, P1, P2 of the spec ``dmhe-pre-estimation`` 3.4 are one definition each).
+P and A change with weight and matrix data only; q, l, u are affine in the vector data. `condense` gives the same
+problem in fewer unknowns (windows F1, F2, F3, P1, P2 of the spec ``dmhe-pre-estimation`` 3.4 are one definition each).
 """
 
 from __future__ import annotations
@@ -67,7 +67,12 @@ class Reduced:
     """
 
     def __init__(
-        self, rows: list[Rows], lower: Bounds, upper: Bounds, map_: AffineMap, equality: tuple[Matrix, Matrix, np.ndarray]
+        self,
+        rows: list[Rows],
+        lower: Bounds,
+        upper: Bounds,
+        map_: AffineMap,
+        equality: tuple[Matrix, Matrix, np.ndarray],
     ) -> None:
         self.map, self.lower, self.upper = map_, lower, upper
         self._original = rows
@@ -95,6 +100,7 @@ class Reduced:
         m = self.equalities
         return null_space(self.A[:m], self.E[:m], self.c[:m]) if m else None
 
+    @cached_property
     def without_equalities(self) -> Reduced:
         """The same program on the solutions of its equalities (dense only)."""
         if self.inner is None:
@@ -309,4 +315,3 @@ def _slot(entry: Any, problem: Problem) -> Slot:
     if not isinstance(slot, Slot) or slot.source.problem is not problem:
         raise DefinitionError(f"eliminate takes variables of problem {problem.name!r}, got {entry!r}")
     return slot
-

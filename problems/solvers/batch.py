@@ -20,7 +20,6 @@ from problems.solvers.base import Status
 from problems.solvers.session import Session, Solution
 
 if TYPE_CHECKING:
-    from problems.solvers.qp_maps import DenseMap, SparseMap
     from problems.solvers.qp_session import QPSession
 
 Maps = "DenseMap | SparseMap"
@@ -163,7 +162,7 @@ class QPBatch(BatchSession):
         part = self._slices[name]
         entry = self.layout.problem.inputs[name]
         missing = bool(np.isnan(rows).any())
-        slow = name in self.session.slow
+        slow = name in self.session.slow or name in self.session.switching
         if self._groups is not None and (missing or self._missing or slow):
             before = self.numbers[:, part]
             if slow and not np.array_equal(before, np.broadcast_to(rows, before.shape), equal_nan=True):
@@ -209,7 +208,7 @@ class QPBatch(BatchSession):
         for entries, fork, map_ in groups:
             whole = entries.size == self.count
             rows = numbers if whole else numbers[entries]
-            if map_.free is not None or not fork.screens:
+            if not (map_.definite and fork.screens):
                 violated = np.arange(entries.size)
             else:
                 z, excess = map_.many(rows)

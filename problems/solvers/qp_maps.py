@@ -6,6 +6,7 @@ T; `SparseMap` (large problems) keeps the factorized KKT system instead.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,19 @@ from problems.errors import UnobservableError
 from problems.forms.layout import DataStore
 from problems.forms.quadratic import QuadraticProgram, Reduced
 
-INDEPENDENT = 1e-13  # share of a Hessian diagonal left after elimination, below which a direction counts as free
+INDEPENDENT = 1e-13  # share of a Hessian diagonal left after elimination, below which a direction may be free
+FREE = 1e-12  # eigenvalue of the Hessian scaled to unit diagonal, below which a direction is free
+SHIFT = 1e-10  # added to a scaled singular system to find its free direction
 
 
 class DenseMap:
-    """See the module; also P, Q, q0 of the quadratic program in the coordinates of `reduced`."""
+    """See the module; also P, Q, q0 of the quadratic program in the coordinates of `reduced`.
+
+    Attributes:
+        free: a direction in all unknowns that no cost sees, or None.
+        definite: there is an affine answer. Where only linear costs and inequalities hold an unknown (exact penalties),
+            neither is it free nor is there one.
+    """
 
     def __init__(
         self, program: QuadraticProgram, reduced: Reduced, store: DataStore, flags: dict[str, Any], pattern: bytes
@@ -34,12 +43,17 @@ class DenseMap:
         else:
             NP = inner.Z.T @ self.P
             H, G, g = NP @ inner.Z, inner.Z.T @ self.Q + NP @ inner.Y, inner.Z.T @ self.q0 + NP @ inner.z0
-        self.free = _free_direction(H)
-        if self.free is not None:
-            self.free = reduced.map.Z @ (self.free if inner is None else inner.Z @ self.free)
+        self.free = None
+        flat = _flat_directions(H)
+        self.definite = flat is None
+        if flat is not None:
+            unseen = flat[:, :1] if not reduced.bounded else _unseen(flat, np.column_stack([G, g]))
+            if unseen.size:
+                direction = unseen[:, 0]
+                self.free = reduced.map.Z @ (direction if inner is None else inner.Z @ direction)
             return
-        factor, _ = dpotrf(H, lower=1)
-        K, _ = dpotrs(factor, np.column_stack([G, g]), lower=1)
+        right = np.column_stack([G, g])
+        K = dpotrs(dpotrf(H, lower=1)[0], right, lower=1)[0] if H.size else right
         V, v = -K[:, :-1], -K[:, -1]
         if inner is not None:
             V, v = inner.Z @ V + inner.Y, inner.Z @ v + inner.z0
@@ -74,18 +88,27 @@ class DenseMap:
         return out[:, : self.size], out[:, self.size :]
 
 
-def _free_direction(H: np.ndarray) -> np.ndarray | None:
-    """A direction that costs nothing, or None where H is positive definite (scale-free test)."""
-    factor, info = dpotrf(H, lower=1)
-    if info == 0:
-        left = np.diagonal(factor) ** 2
-        if (left > INDEPENDENT * np.diagonal(H)).all():
-            return None
-    scale = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
-    if np.isfinite(values).all() and values[0] > 1e-12:
+def _flat_directions(H: np.ndarray) -> np.ndarray | None:
+    """Directions (n, k) without curvature, or None where H is positive definite (scale-free test)."""
+    if not H.size:
         return None
-    return vectors[:, 0] / scale
+    factor, info = dpotrf(H, lower=1)
+    if info == 0 and (np.diagonal(factor) ** 2 > INDEPENDENT * np.diagonal(H)).all():
+        return None
+    diagonal = np.diagonal(H)
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    flat = values <= FREE
+    return vectors[:, flat] / scale[:, None] if flat.any() else None
+
+
+def _unseen(flat: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Directions among the columns of `flat` on which no column of the linear cost acts."""
+    seen = flat.T @ linear
+    sizes = np.linalg.norm(flat, axis=0)[:, None] * np.linalg.norm(linear, axis=0).max(initial=0.0)
+    U, values, _ = np.linalg.svd(seen / np.maximum(sizes, 1e-300))
+    rank = int((values > 1e-9).sum())
+    return flat @ U[:, rank:]
 
 
 class SparseMap:
@@ -96,27 +119,22 @@ class SparseMap:
     ) -> None:
         self.reduced, self.flags = reduced, flags
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
-        m, n = reduced.equalities, reduced.size
-        A = reduced.A[:m]
-        kkt = sp.block_array([[self.P, A.T], [A, None]], format="csc") if m else sp.csc_array(self.P)
-        self.free = None
-        try:
-            self._factor = spla.splu(kkt, permc_spec="MMD_AT_PLUS_A" if not m else "COLAMD")
-            pivots = np.abs(self._factor.U.diagonal())
-            if not m and (pivots.min() <= INDEPENDENT * pivots.max() ** 0 * np.abs(kkt.diagonal()).min()):
-                self.free = np.zeros(n)
-        except RuntimeError:
-            self.free = np.zeros(n)
-        if self.free is not None:
-            self.free[int(np.argmin(np.abs(self.P.diagonal())))] = 1.0
-            self.free = reduced.map.Z @ self.free
+        solver, flat = factorized_kkt(self.P, reduced.A[: reduced.equalities])
+        self.free, self.definite = None, flat is None
+        if solver is not None:
+            self._solve = solver
+        if flat is not None:
+            linear = np.append(abs(self.Q.T @ flat), abs(self.q0 @ flat)).max()
+            size = np.linalg.norm(flat) * max(spla.norm(self.Q), float(np.linalg.norm(self.q0)))
+            if not reduced.bounded or linear <= 1e-9 * size:
+                self.free = reduced.map.Z @ flat
 
     def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reduced = self.reduced
         m = reduced.equalities
         q = self.Q @ numbers + self.q0
         shift = reduced.E @ numbers + reduced.c
-        v = self._factor.solve(np.concatenate([-q, -shift[:m]]))[: reduced.size]
+        v = self._solve(np.concatenate([-q, -shift[:m]]))[: reduced.size]
         z = reduced.map.Z @ v + reduced.map.Y @ numbers + reduced.map.z0
         l, u = reduced.bounds(numbers, self.flags)
         rows = reduced.A[m:] @ v
@@ -126,6 +144,46 @@ class SparseMap:
         """The same for many rows of numbers."""
         answers = [self(row) for row in numbers]
         return np.array([z for z, _ in answers]), np.array([excess for _, excess in answers])
+
+
+def factorized_kkt(P: Any, A: Any) -> tuple[Callable[[np.ndarray], np.ndarray] | None, np.ndarray | None]:
+    """Solver of ``[P A'; A 0]`` (sparse), and a direction with ``A d = 0`` that P does not see, or None.
+
+    The direction comes from inverse iteration on the system scaled to unit diagonal. Rows of A may repeat.
+    """
+    n, m = P.shape[0], A.shape[0]
+    diagonal = P.diagonal()
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    rows = spla.norm(A @ sp.diags_array(scale), axis=1) if m else np.zeros(0)
+    scale = np.concatenate([scale, 1 / np.where(rows > 0, rows, 1.0)])
+    D = sp.diags_array(scale)
+    system = sp.csc_array(D @ sp.block_array([[P, A.T], [A, None]]) @ D) if m else sp.csc_array(D @ P @ D)
+    # keeps repeated rows apart without moving the solution
+    system = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, 1e-14)]))
+    order = "COLAMD" if m else "MMD_AT_PLUS_A"
+    try:
+        factor = spla.splu(sp.csc_matrix(system), permc_spec=order)
+    except RuntimeError:
+        factor = None
+    shifted = factor or spla.splu(
+        sp.csc_matrix(system + SHIFT * sp.diags_array(np.concatenate([np.ones(n), -np.ones(m)]))), permc_spec=order
+    )
+    direction, growth = np.cos(np.arange(n)), 0.0
+    for _ in range(4):
+        direction = shifted.solve(np.concatenate([direction, np.zeros(m)]))[:n]
+        growth = np.linalg.norm(direction)
+        direction = direction / max(growth, 1e-300)
+    flat = factor is None or not growth < 1 / FREE
+
+    def solve(right: np.ndarray) -> np.ndarray:
+        assert factor is not None
+        return (
+            scale * factor.solve(scale * right)
+            if right.ndim == 1
+            else scale[:, None] * factor.solve(scale[:, None] * right)
+        )
+
+    return (None if factor is None else solve), (scale[:n] * direction if flat else None)
 
 
 def require_observable(program: QuadraticProgram, free: np.ndarray) -> None:

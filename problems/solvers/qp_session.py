@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from problems.errors import DataError, SettingError
+from problems.errors import DataError, MissingExtraError, SettingError
 from problems.forms.affine_marginal import AffineMarginal
 from problems.forms.marginal import Marginal
 from problems.forms.quadratic import QuadraticProgram, clean
 from problems.problem import DataSlot, Slot
-from problems.solvers.batch import QPBatch
 from problems.solvers.base import Options, QPBackend, QPResult, Status
+from problems.solvers.batch import QPBatch
 from problems.solvers.qp_check import judge
 from problems.solvers.qp_maps import DenseMap, SparseMap, require_observable
 from problems.solvers.qp_solution import QPCheck
@@ -33,6 +33,10 @@ class QPSession(Session):
         backend: class of the QP solver.
         screen: answer by the affine map where no inequality is violated.
         warm: start a backend from the last QP solution.
+
+    Attributes:
+        slow: names of weight and matrix data, whose change makes new maps.
+        switching: names of data that are nothing but flags, which are part of the pattern.
     """
 
     form = "quadratic"
@@ -51,7 +55,8 @@ class QPSession(Session):
         self.warm = warm
         self.screens = screen
         self._backend_type = backend
-        self.slow = frozenset(name for name, speed in program.speeds.items() if speed != "vector")
+        self.switching = _switching(program)
+        self.slow = frozenset(n for n, speed in program.speeds.items() if speed != "vector") - self.switching
         self._switches = program.activity.switches.size > 0
         self._bound_numbers = _bound_positions(program)
         self._maps: dict[bytes, DenseMap | SparseMap] = {}
@@ -62,14 +67,14 @@ class QPSession(Session):
         self._check_without_data()
 
     def _check_without_data(self) -> None:
-        """What can be seen before any data: unknowns that no cost sees."""
-        needed = [n for n in self.slow if not self.store.given[n]]
-        if needed:
+        """What can be seen before any data: unknowns that no cost sees although nothing is missing or switched off."""
+        if not all(self.store.given[name] for name in self.slow):
             return
         numbers = clean(self.store.numbers)
-        store = self.store.copy(numbers)
-        map_ = self._make(b"", numbers, store)
-        if map_.free is not None:
+        numbers[self.program.activity.switches] = 1.0
+        map_ = self._make(b"", numbers, self.store.copy(numbers))
+        # weights and matrices that are data may yet see what their defaults do not
+        if map_.free is not None and not self.slow:
             require_observable(self.program, map_.free)
         if not self._switches:
             self._maps[b""] = map_
@@ -115,7 +120,7 @@ class QPSession(Session):
         flags = program.flags(store.numbers)
         reduced = program.reduced(numbers)
         if self.screens and program.dense and not program.eliminated:
-            reduced = reduced.without_equalities()
+            reduced = reduced.without_equalities
         return (DenseMap if program.dense else SparseMap)(program, reduced, store, flags, pattern)
 
     def _solve(self) -> Solution:
@@ -129,7 +134,7 @@ class QPSession(Session):
             return Solution(
                 self.layout, point, Status.UNBOUNDED, self.solver, _check(self, numbers, map_, point), 0, message
             )
-        if self.screens:
+        if self.screens and map_.definite:
             z, excess = map_(numbers)
             if not excess.size or excess.max() <= self.options.tolerance:
                 return Solution(self.layout, z, Status.SOLVED, "linear", _check(self, numbers, map_, z))
@@ -191,14 +196,19 @@ class QPSession(Session):
 
     def _call(self, map_: DenseMap | SparseMap, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> QPResult:
         reduced = map_.reduced
+        if not reduced.size:  # the equalities leave nothing to choose
+            if (l <= self.options.tolerance).all() and (u >= -self.options.tolerance).all():
+                return QPResult(np.zeros(0), np.zeros(l.size), Status.SOLVED)
+            return QPResult(None, None, Status.INFEASIBLE, 0, "the only point of the equalities violates an inequality")
         try:
-            if self._backend is None:
+            if self._backend is None or (self._loaded and self._loaded.reduced.A.shape != reduced.A.shape):
+                self.last = None
                 self._backend = self._backend_type(map_.P, q, reduced.A, l, u, self.options)
             elif self._loaded is not map_:
                 self._backend.update(map_.P, reduced.A)
             self._loaded = map_
             return self._backend.solve(q, l, u, self.last if self.warm else None)
-        except SettingError:
+        except (SettingError, MissingExtraError):
             raise
         except Exception as error:  # a backend that breaks is a status, and the next solve starts afresh
             self._backend, self._loaded, self.last = None, None, None
@@ -224,6 +234,14 @@ def _slot_key(chosen: Any) -> Any:
     if isinstance(chosen, (tuple, list)):
         return tuple(_slot_key(entry) for entry in chosen)
     return (id(chosen.source), chosen.indices.tobytes()) if isinstance(chosen, Slot) else id(chosen)
+
+
+def _switching(program: QuadraticProgram) -> frozenset[str]:
+    """Names of data that switch instances and are neither weights nor read by residuals."""
+    terms = program.problem.terms.values()
+    switches = {t.active.source.name for t in terms if isinstance(t.active, DataSlot)}
+    weights = {t.noise.value.source.name for t in terms if t.noise and isinstance(t.noise.value, DataSlot)}
+    return frozenset(name for name in switches - weights if program.speeds[name] == "weight")
 
 
 def _bound_positions(program: QuadraticProgram) -> np.ndarray:
