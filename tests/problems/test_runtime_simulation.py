@@ -461,8 +461,8 @@ class TestAsynchronous:
         ]
         fates = np.zeros((2, 640))
         fates[tuple(np.array(arrivals).T)] = 1
-        table = fates.reshape(20, 32)
-        assert np.abs(np.corrcoef(table) - np.eye(20)).max() < 4.5 / np.sqrt(32)
+        table = fates.reshape(20, 64)
+        assert np.abs(np.corrcoef(table) - np.eye(20)).max() < 4.5 / np.sqrt(64)
         assert abs(np.corrcoef(fates)[0, 1]) < 4 / np.sqrt(640)
 
     def test_death_loses_events_and_memory(self) -> None:
