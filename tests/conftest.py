@@ -158,7 +158,7 @@ broken = toy_scenarios_that_do_not_exist:nothing
 """
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def toy_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A package of somebody else that registers scenarios, solvers and commands; worker processes see it too."""
     folder = tmp_path_factory.mktemp("toy_package")
@@ -171,4 +171,5 @@ def toy_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     registry._entries.cache_clear()
     yield folder
     sys.path.remove(str(folder))
+    sys.modules.pop("toy_scenarios", None)
     registry._entries.cache_clear()

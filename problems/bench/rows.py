@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -77,12 +77,18 @@ class Row:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON types only; `from_dict` reads it back."""
-        return asdict(self)
+        record = _shallow(self) | {"job": _shallow(self.job)}
+        return record | {"failure": _shallow(self.failure) if self.failure else None}
 
     @staticmethod
     def from_dict(record: dict[str, Any]) -> Row:
         failure = record["failure"]
         return Row(**(record | {"job": Job(**record["job"]), "failure": Failure(**failure) if failure else None}))
+
+
+def _shallow(value: Any) -> dict[str, Any]:
+    # dataclasses.asdict copies deeply, which costs more than all the rest of writing a row
+    return {item.name: getattr(value, item.name) for item in fields(value)}
 
 
 def finite(value: Any) -> float | None:

@@ -129,10 +129,11 @@ def reproduce(job: Job, defaults: dict[str, Any], trials: int | None = None) -> 
 
 
 def varied(summaries: Sequence[Summary]) -> list[str]:
-    """Names of the settings that differ between summaries of the same scenario."""
+    """Names of the settings that differ between summaries of the same scenario, in the scenario's order."""
     first: dict[str, dict[str, Any]] = {}
-    names: dict[str, None] = {}
+    different: dict[str, bool] = {}
     for summary in summaries:
         reference = first.setdefault(summary.scenario, summary.settings)
-        names |= dict.fromkeys(key for key, value in summary.settings.items() if value != reference.get(key))
-    return list(names)
+        for key, value in summary.settings.items():
+            different[key] = different.get(key, False) or value != reference.get(key)
+    return [key for key, differs in different.items() if differs]

@@ -84,7 +84,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
         settings, metrics = columns(rows)
         head = ["method", "solver", *settings]
         numeric = [*metrics, "step (median)", "step (p95)", "solve", "solved", "failed trials"]
-        made = table(f"{name}, {rows[0].trials} trial(s), seed {rows[0].seed}", [*head, *numeric], numeric)
+        made = table(f"{name}, {_counted(rows)}", [*head, *numeric], numeric)
         for row in rows:
             made.add_row(
                 row.method,
@@ -96,6 +96,13 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
                 str(row.failed),
             )
         console().print(made)
+
+
+def _counted(rows: Sequence[Summary]) -> str:
+    fewest, most = min(row.trials for row in rows), max(row.trials for row in rows)
+    trials = f"{most} trial{'s' if most > 1 else ''}" if fewest == most else f"{fewest} to {most} trials"
+    seeds = list(dict.fromkeys(str(row.seed) for row in rows))
+    return f"{trials}, seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
 
 
 def print_failures(rows: Iterable[Row], defaults: Callable[[Job], dict[str, Any]]) -> int:
