@@ -16,9 +16,7 @@ from problems.problem import DataSlot
 class AffineMarginal:
     """``M`` and ``gradient = G d + g`` at zero for one pattern of active instances; calling it gives a `Marginal`."""
 
-    def __init__(
-        self, program: QuadraticProgram, store: DataStore, numbers: np.ndarray, drop: Any, keep: Any
-    ) -> None:
+    def __init__(self, program: QuadraticProgram, store: DataStore, numbers: np.ndarray, drop: Any, keep: Any) -> None:
         layout = program.layout
         dropped, self._slots, kept = selection(layout, drop, keep)
         involved = np.concatenate([dropped, kept])

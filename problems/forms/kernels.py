@@ -66,13 +66,13 @@ def cost_kernel(template: Template, full: bool, linear: bool, loss: Loss, switch
     e, Je = ca.mtimes(U, r), ca.mtimes(U, template.jacobian)
     Je = ca.densify(Je)
     if switched:
-        e = _gate(on, e)
-        Je = _gate(on, Je)
+        e = gate(on, e)
+        Je = gate(on, Je)
     s = ca.sumsqr(e)
     rho, w = loss.rho(s), loss.weight(s)
     value, gradient = rho, w * ca.mtimes(Je.T, e)
     if linear:
-        rows, slopes = (_gate(on, r), _gate(on, J)) if switched else (r, J)
+        rows, slopes = (gate(on, r), gate(on, J)) if switched else (r, J)
         value = value + ca.dot(lam, rows)
         gradient = gradient + ca.mtimes(slopes.T, lam)
     H = ca.mtimes(ca.sparsify(Je).T, ca.sparsify(Je))
@@ -82,7 +82,7 @@ def cost_kernel(template: Template, full: bool, linear: bool, loss: Loss, switch
     return CostKernel(inputs, value, ca.densify(gradient), hessian, pairs, loss)
 
 
-def _gate(on: ca.SX, value: ca.SX) -> ca.SX:
+def gate(on: ca.SX, value: ca.SX) -> ca.SX:
     """`value` where on is not 0, else exactly 0."""
     flat = [ca.if_else(on, value.nz[k], 0) for k in range(value.nnz())]
     return ca.SX(value.sparsity(), ca.vertcat(*flat)) if flat else value

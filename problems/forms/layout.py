@@ -225,6 +225,18 @@ class Layout:
         start, ambient = self.stored_start[name], variable.space.ambient
         return point[..., start : start + variable.count * ambient].reshape(*point.shape[:-1], variable.count, ambient)
 
+    def names_of(self, direction: np.ndarray) -> str:
+        """Variables with a share in a tangent direction, for messages; empty where it is zero."""
+        largest = np.abs(direction).max(initial=0.0)
+        names = []
+        for name, variable in self.problem.unknowns.items():
+            start, dim = self.start[name], variable.space.dim
+            part = np.abs(direction[start : start + variable.count * dim]).reshape(variable.count, dim)
+            rows = np.flatnonzero((part > 1e-3 * largest).any(axis=1))
+            if rows.size:
+                names.append(f"{name}[{rows[0]}]" + (f" and {rows.size - 1} more" if rows.size > 1 else ""))
+        return ", ".join(names)
+
     def retract(self, point: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The point moved by a tangent step."""
         out = np.empty_like(point)

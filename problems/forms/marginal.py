@@ -126,7 +126,9 @@ def marginal(problem: Problem, layout: Layout, store: DataStore, drop: Any, keep
             e, Je = U @ r[k], U @ J[k]
             w = float(term.loss.weight(float(e @ e)))
             np.add.at(H, (at[k][:, None], at[k][None]), w * Je.T @ Je)
-            np.add.at(g, at[k], w * Je.T @ e + J[k].T @ _linear(layout, entry.linear, term, numbers, int(row), r.shape[1]))
+            np.add.at(
+                g, at[k], w * Je.T @ e + J[k].T @ _linear(layout, entry.linear, term, numbers, int(row), r.shape[1])
+            )
     M, gradient = schur(H, g[:, None], np.vstack(F), np.concatenate(f)[:, None], dropped.size)
     reference = tuple(_stored(layout, point, slot) for slot in slots)
     return Marginal(tuple(slots), M, -gradient[:, 0], reference)

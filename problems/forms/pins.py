@@ -27,7 +27,9 @@ class Pins:
         self._terms = [
             e
             for e in layout.terms
-            if e.term.kind == "equality" and len(e.term.slots) == 1 and template_of(e.term).dim == template_of(e.term).width
+            if e.term.kind == "equality"
+            and len(e.term.slots) == 1
+            and template_of(e.term).dim == template_of(e.term).width
         ]
         self.names = frozenset(e.term.name for e in self._terms)
         columns = [e.columns.ravel() for e in self._terms]

@@ -149,11 +149,7 @@ def _generate(function: ca.Function, arrays: tuple[bool, ...]) -> Callable[..., 
         if any(is_array for _, is_array in operands):
             buffers.add(register)
             target = f"b{register}"
-            body.append(
-                f"{target}[:] = {expression}"
-                if op == ca.OP_IF_ELSE_ZERO
-                else f"{expression}, out={target})"
-            )
+            body.append(f"{target}[:] = {expression}" if op == ca.OP_IF_ELSE_ZERO else f"{expression}, out={target})")
             place[register] = (target, True)
         else:
             place[register] = scalar(expression if op == ca.OP_IF_ELSE_ZERO else f"{expression}) * 1.0")

@@ -1,0 +1,1 @@
+"""Commands of the localization package, registered in ``horizonet.commands``."""

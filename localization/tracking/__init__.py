@@ -1,0 +1,1 @@
+"""Estimators that follow moving targets causally."""
