@@ -6,12 +6,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
 
-from problems.errors import UnobservableError
 from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.forms.selection import columns_of
-from problems.solvers.linear import SingularError, factorization
+from problems.solvers.linear import covariance_blocks
 
 
 class LeastSquaresCheck:
@@ -45,8 +46,6 @@ class LeastSquaresCheck:
     @cached_property
     def _rows(self) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray]:
         """Values, Jacobian, bounds of the constraints."""
-        import scipy.sparse as sp
-
         c = self._constraints
         values, entries = c.evaluate(self._point, self._numbers)
         J = sp.csr_array(sp.coo_array((entries, (c.rows, c.columns)), shape=(c.size, self._form.pattern.size)))
@@ -57,8 +56,6 @@ class LeastSquaresCheck:
     def _multipliers(self) -> np.ndarray:
         if self._given is not None or not self._constraints.size:
             return np.zeros(0) if self._given is None else self._given
-        import scipy.sparse.linalg as spla
-
         values, J, lower, upper = self._rows
         near = 1e-6 * np.maximum(1.0, np.abs(values))
         active = np.flatnonzero((values >= upper - near) | (values <= lower + near))
@@ -111,19 +108,10 @@ class LeastSquaresCheck:
         hessian = self._linearized[1].copy()
         pattern = self._form.pattern
         self._pins.reduce(np.zeros(pattern.size), hessian, pattern)
-        solver = factorization(pattern)
-        right = np.zeros((pattern.size, columns.size))
-        right[columns, np.arange(columns.size)] = 1.0
-        try:
-            if (hessian[pattern.diagonal] <= 0).any():
-                raise SingularError("an unknown appears in no cost")
-            solver.factor(hessian)
-            block = solver.solve(right)[columns]
-        except SingularError as error:
-            raise UnobservableError(f"no covariance: the costs leave a direction free ({error})") from error
-        if not np.isfinite(block).all() or (np.diagonal(block) <= 0).any():
-            raise UnobservableError("no covariance: the costs leave a direction free; add a prior or fix the gauge")
-        pinned = np.isin(columns, self._pins.columns)
-        block[pinned] = 0.0
-        block[:, pinned] = 0.0
-        return (block + block.T) / 2
+        half = sp.csc_array((hessian, pattern.indices, pattern.indptr), shape=(pattern.size, pattern.size))
+        full = half + half.T - sp.diags_array(hessian[pattern.diagonal])
+        moving = np.ones(pattern.size)
+        moving[self._pins.columns] = 0.0
+        F = self._rows[1][: self._constraints.equalities] @ sp.diags_array(moving)
+        block = covariance_blocks(self._form.layout, full, F, columns)
+        return block * np.outer(moving[columns], moving[columns])

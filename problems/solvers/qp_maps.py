@@ -6,21 +6,18 @@ T; `SparseMap` (large problems) keeps the factorized KKT system instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from problems.errors import UnobservableError
 from problems.forms.layout import DataStore
 from problems.forms.quadratic import QuadraticProgram, Reduced
+from problems.solvers.linear import FREE, factorized_kkt
 
 INDEPENDENT = 1e-13  # share of a Hessian diagonal left after elimination, below which a direction may be free
-FREE = 1e-12  # eigenvalue of the Hessian scaled to unit diagonal, below which a direction is free
-SHIFT = 1e-10  # added to a scaled singular system to find its free direction
 
 
 class DenseMap:
@@ -121,8 +118,7 @@ class SparseMap:
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
         solver, flat = factorized_kkt(self.P, reduced.A[: reduced.equalities])
         self.free, self.definite = None, flat is None
-        if solver is not None:
-            self._solve = solver
+        self._solve: Any = solver
         if flat is not None:
             linear = np.append(abs(self.Q.T @ flat), abs(self.q0 @ flat)).max()
             size = np.linalg.norm(flat) * max(spla.norm(self.Q), float(np.linalg.norm(self.q0)))
@@ -146,57 +142,10 @@ class SparseMap:
         return np.array([z for z, _ in answers]), np.array([excess for _, excess in answers])
 
 
-def factorized_kkt(P: Any, A: Any) -> tuple[Callable[[np.ndarray], np.ndarray] | None, np.ndarray | None]:
-    """Solver of ``[P A'; A 0]`` (sparse), and a direction with ``A d = 0`` that P does not see, or None.
-
-    The direction comes from inverse iteration on the system scaled to unit diagonal. Rows of A may repeat.
-    """
-    n, m = P.shape[0], A.shape[0]
-    diagonal = P.diagonal()
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    rows = spla.norm(A @ sp.diags_array(scale), axis=1) if m else np.zeros(0)
-    scale = np.concatenate([scale, 1 / np.where(rows > 0, rows, 1.0)])
-    D = sp.diags_array(scale)
-    system = sp.csc_array(D @ sp.block_array([[P, A.T], [A, None]]) @ D) if m else sp.csc_array(D @ P @ D)
-    # keeps repeated rows apart without moving the solution
-    system = system - sp.diags_array(np.concatenate([np.zeros(n), np.full(m, 1e-14)]))
-    order = "COLAMD" if m else "MMD_AT_PLUS_A"
-    try:
-        factor = spla.splu(sp.csc_matrix(system), permc_spec=order)
-    except RuntimeError:
-        factor = None
-    shifted = factor or spla.splu(
-        sp.csc_matrix(system + SHIFT * sp.diags_array(np.concatenate([np.ones(n), -np.ones(m)]))), permc_spec=order
-    )
-    direction, growth = np.cos(np.arange(n)), 0.0
-    for _ in range(4):
-        direction = shifted.solve(np.concatenate([direction, np.zeros(m)]))[:n]
-        growth = np.linalg.norm(direction)
-        direction = direction / max(growth, 1e-300)
-    flat = factor is None or not growth < 1 / FREE
-
-    def solve(right: np.ndarray) -> np.ndarray:
-        assert factor is not None
-        return (
-            scale * factor.solve(scale * right)
-            if right.ndim == 1
-            else scale[:, None] * factor.solve(scale[:, None] * right)
-        )
-
-    return (None if factor is None else solve), (scale[:n] * direction if flat else None)
-
-
 def require_observable(program: QuadraticProgram, free: np.ndarray) -> None:
     """Raises UnobservableError naming the unknowns that the costs leave free."""
-    share = np.abs(free) / max(np.abs(free).max(), 1e-300)
-    names = []
-    for name, variable in program.problem.unknowns.items():
-        start = program.layout.start[name]
-        part = share[start : start + variable.count * variable.space.dim].reshape(variable.count, -1)
-        rows = np.flatnonzero((part > 1e-3).any(axis=1))
-        if rows.size:
-            names.append(f"{name}[{rows[0]}]" + (f" and {rows.size - 1} more" if rows.size > 1 else ""))
+    names = program.layout.names_of(free) or "all unknowns"
     raise UnobservableError(
-        f"the costs of problem {program.problem.name!r} do not determine {', '.join(names) or 'all unknowns'}; add a "
-        "prior or a measurement that sees them"
+        f"the costs of problem {program.problem.name!r} do not determine {names}; add a prior or a measurement that "
+        "sees them"
     )

@@ -13,12 +13,12 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from problems.errors import UnobservableError
 from problems.forms.affine import Rows, information_of, weigh
 from problems.forms.layout import DataStore, constant_rows
 from problems.forms.quadratic import QuadraticProgram
 from problems.forms.selection import columns_of
 from problems.problem import DataSlot
+from problems.solvers.linear import covariance_blocks
 
 
 class QPCheck:
@@ -172,24 +172,5 @@ class QPCheck:
         for rows in self._kind("cost"):
             W = information_of(rows, self._data, self._flags.get(rows.layout.term.name))
             P = P + weigh(rows, W).T @ rows.R
-        equal = self._kind("equality")
-        n = self._z.size
-        try:
-            if isinstance(P, np.ndarray):
-                F = np.vstack([r.R for r in equal]) if equal else np.zeros((0, n))
-                kkt = np.block([[P, F.T], [F, np.zeros((F.shape[0], F.shape[0]))]])
-                right = np.zeros((kkt.shape[0], columns.size))
-                right[columns, np.arange(columns.size)] = 1.0
-                solved = np.linalg.solve(kkt, right)
-            else:
-                F = sp.vstack([r.R for r in equal], format="csr") if equal else None
-                kkt = sp.csc_matrix(P if F is None else sp.block_array([[P, F.T], [F, None]]))
-                right = np.zeros((kkt.shape[0], columns.size))
-                right[columns, np.arange(columns.size)] = 1.0
-                solved = spla.splu(kkt).solve(right)
-        except (np.linalg.LinAlgError, RuntimeError) as error:
-            raise UnobservableError(f"no covariance: the costs leave a direction free ({error})") from error
-        block = solved[columns]
-        return (block + block.T) / 2
-
-
+        F = sp.vstack([sp.csr_array((0, self._z.size)), *(r.R for r in self._kind("equality"))], format="csr")
+        return covariance_blocks(program.layout, sp.csr_array(P), F, columns)
