@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from problems.errors import DefinitionError, UnobservableError
-from problems.forms.layout import Activity, DataStore, Layout
+from problems.forms.layout import Activity, DataStore, Layout, constant_rows
 from problems.forms.least_squares import whitening_numbers
 from problems.forms.residual_code import residual_code
 from problems.forms.selection import columns_of, slots_of
@@ -43,7 +43,7 @@ def selection(layout: Layout, drop: Any, keep: Any) -> tuple[np.ndarray, list[Sl
     Kept are the slots in `keep`, or all instances that share a cost or equality with a dropped one.
 
     Raises:
-        DefinitionError: `keep` leaves out an instance that shares a term with a dropped one.
+        DefinitionError: `keep` leaves out an instance that shares a term with a dropped one, or names one twice.
     """
     dropped = np.unique(columns_of(layout, drop, "marginal"))
     touched = []
@@ -64,6 +64,8 @@ def selection(layout: Layout, drop: Any, keep: Any) -> tuple[np.ndarray, list[Sl
     columns = np.concatenate([layout.columns(s).ravel() for s in slots]) if slots else np.zeros(0, np.intp)
     if np.setdiff1d(shared, columns).size:
         raise DefinitionError("marginal: `keep` leaves out variables that share a cost or equality with dropped ones")
+    if np.unique(np.concatenate([dropped, columns])).size < dropped.size + columns.size:
+        raise DefinitionError("marginal: `keep` names an instance twice, or one that is dropped")
     return dropped, slots, columns
 
 
@@ -83,10 +85,11 @@ def schur(H: np.ndarray, G: np.ndarray, F: np.ndarray, E: np.ndarray, drop: int)
     K[:drop, :drop] = H[:drop, :drop]
     K[:drop, drop:], K[drop:, :drop] = F[:, :drop].T, F[:, :drop]
     cross = np.vstack([H[:drop, drop:], F[:, drop:]])
-    try:
-        solved = np.linalg.solve(K, np.column_stack([cross, np.vstack([G[:drop], E])]))
-    except np.linalg.LinAlgError as error:
-        raise UnobservableError("marginal: the costs leave a dropped variable free, or its equalities clash") from error
+    largest = np.abs(K).max(axis=1, initial=0.0)
+    scale = 1 / np.sqrt(np.where(largest > 0, largest, 1.0))
+    if K.size and np.linalg.cond(K * np.outer(scale, scale)) > 1e12:
+        raise UnobservableError("marginal: the costs leave a dropped variable free, or its equalities clash")
+    solved = np.linalg.solve(K, np.column_stack([cross, np.vstack([G[:drop], E])]))
     k = cross.shape[1]
     M = H[drop:, drop:] - cross.T @ solved[:, :k]
     return (M + M.T) / 2, G[drop:] - cross.T @ solved[:, k:]
@@ -151,4 +154,4 @@ def _linear(layout: Layout, index: Any, term: Any, numbers: np.ndarray, row: int
         return np.zeros(dim)
     if isinstance(term.linear, DataSlot):
         return np.broadcast_to(numbers[index], (term.count, dim))[row]
-    return np.broadcast_to(np.asarray(term.linear, dtype=float), (term.count, dim))[row]
+    return constant_rows(term.linear, dim, term.count, term.what)[row]

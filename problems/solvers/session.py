@@ -18,9 +18,9 @@ from problems.forms.layout import DataStore, Layout
 from problems.solvers.base import Options, Status
 
 if TYPE_CHECKING:
-    from problems.solvers.batch import BatchSession
     from problems.forms.marginal import Marginal
     from problems.problem import Problem, Slot, Variable
+    from problems.solvers.batch import BatchSession
 
 
 class Check(Protocol):
@@ -104,7 +104,9 @@ class Solution:
         return self._check.covariance(slots)
 
     def __repr__(self) -> str:
-        lines = [f"Solution: {self.status} by {self.method}, {self.iterations} iteration(s), objective {self.objective:.6g}"]
+        lines = [
+            f"Solution: {self.status} by {self.method}, {self.iterations} iteration(s), objective {self.objective:.6g}"
+        ]
         lines += [f"  {name}: {np.array2string(v, precision=4, threshold=8)}" for name, v in self.values.items()]
         return "\n".join(lines + ([f"  {self.message}"] if self.message else []))
 
@@ -204,7 +206,7 @@ class Session(ABC):
 
         Raises:
             DataError: there is no point to linearize at.
-            DefinitionError: `keep` misses an instance that shares a term with a dropped one.
+            DefinitionError: `keep` misses an instance that shares a term with a dropped one, or names one twice.
             UnobservableError: the terms leave a dropped unknown free.
         """
         point = self._point if at is None else self.layout.point(at, self._point)
