@@ -7,7 +7,8 @@ zeros and no small dense matrices are formed per instance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from itertools import combinations_with_replacement
 
 import casadi as ca
 
@@ -26,7 +27,6 @@ class CostKernel:
         gradient: SX (width, 1) in tangent coordinates.
         hessian: SX column of the entries `pairs` of the Gauss-Newton Hessian.
         pairs: (a, b) with a <= b, positions in the tangent coordinates of the slots that are not structurally zero.
-        error, whitened: SX whitened residual and Jacobian before the robust weight.
     """
 
     inputs: ca.SX
@@ -34,15 +34,16 @@ class CostKernel:
     gradient: ca.SX
     hessian: ca.SX
     pairs: tuple[tuple[int, int], ...]
-    loss: Loss
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "value_code", ArrayCode(self.inputs, self.value))
-        every = ca.vertcat(self.value, self.gradient, self.hessian)
-        object.__setattr__(self, "code", ArrayCode(self.inputs, every))
+    @cached_property
+    def value_code(self) -> ArrayCode:
+        """The cost alone."""
+        return ArrayCode(self.inputs, self.value)
 
-    value_code: ArrayCode = None  # type: ignore[assignment]
-    code: ArrayCode = None  # type: ignore[assignment]
+    @cached_property
+    def code(self) -> ArrayCode:
+        """Cost, gradient and Hessian entries, one after the other."""
+        return ArrayCode(self.inputs, ca.vertcat(self.value, self.gradient, self.hessian))
 
 
 @lru_cache(maxsize=1024)
@@ -56,8 +57,8 @@ def cost_kernel(template: Template, full: bool, linear: bool, loss: Loss, switch
     if full:
         entries = ca.SX.sym("U", d * (d + 1) // 2)
         U = ca.SX(d, d)
-        for k, (a, b) in enumerate((a, b) for a in range(d) for b in range(a, d)):
-            U[a, b] = entries[k]
+        for k, place in enumerate(combinations_with_replacement(range(d), 2)):
+            U[place] = entries[k]
     else:
         entries = ca.SX.sym("U", d)
         U = ca.diag(entries)
@@ -79,7 +80,7 @@ def cost_kernel(template: Template, full: bool, linear: bool, loss: Loss, switch
     pairs = tuple((a, b) for a in range(width) for b in range(a, width) if H.has_nz(a, b))
     hessian = ca.vertcat(*(w * H[a, b] for a, b in pairs)) if pairs else ca.SX(0, 1)
     inputs = ca.vertcat(template.point, template.numbers, entries, lam, on)
-    return CostKernel(inputs, value, ca.densify(gradient), hessian, pairs, loss)
+    return CostKernel(inputs, value, ca.densify(gradient), hessian, pairs)
 
 
 def gate(on: ca.SX, value: ca.SX) -> ca.SX:
