@@ -17,31 +17,31 @@ def solvers(
     """Solver backends: available or not, forms they take, warm start, version."""
     with one_json_object(as_json) as give:
         found = [_facts(name) for name in registry.names("solvers")]
-        give({"solvers": found})
+        give({"solvers": [facts for facts, _ in found]})
     if as_json:
         return
     made = table(None, ["solver", "available", "version", "forms", "warm start"])
-    for solver in found:
-        extra = f'no: pip install "horizonet[{solver["extra"]}]"' if solver["extra"] else "no"
+    for facts, missing in found:
         made.add_row(
-            solver["name"],
-            "yes" if solver["available"] else extra,
-            solver["version"] or "–",
-            ", ".join(solver["forms"]),
-            "yes" if solver["warm_start"] else "no",
+            facts["name"],
+            "yes" if missing is None else f"no: {missing}",
+            facts["version"] or "–",
+            ", ".join(facts["forms"]),
+            "yes" if facts["warm_start"] else "no",
         )
     console().print(made)
 
 
-def _facts(name: str) -> dict[str, Any]:
+def _facts(name: str) -> tuple[dict[str, Any], str | None]:
+    """What the contract of ``--json`` says of a solver, and why it cannot be used."""
     facts = {"name": name, "available": False, "version": None, "forms": [], "warm_start": False, "extra": None}
     try:
         backend = registry.load("solvers", name)
-        facts |= {
-            "forms": list(getattr(backend, "forms", ("quadratic",))),
-            "warm_start": backend.warm_starts,
-            "extra": backend.extra,
-        }
-        return facts | {"available": True, "version": backend.version()}
+        forms = list(getattr(backend, "forms", ("quadratic",)))
+        facts |= {"forms": forms, "warm_start": backend.warm_starts, "extra": backend.extra}
+        return facts | {"available": True, "version": backend.version()}, None
     except MissingExtraError as error:
-        return facts | {"extra": error.extra or facts["extra"]}
+        extra = error.extra or facts["extra"]
+        return facts | {"extra": extra}, f'pip install "horizonet[{extra}]"' if extra else f"needs {error.package}"
+    except Exception as error:  # somebody else's broken backend hides nothing but itself
+        return facts, str(error)

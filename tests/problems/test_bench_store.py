@@ -148,7 +148,11 @@ def test_a_killed_campaign_keeps_its_rows_and_goes_on(tmp_path: Path, toy_packag
     campaign = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     journal = out / JOURNAL
     deadline = time.monotonic() + 60
-    while not (journal.exists() and journal.read_bytes().count(b'"row"') > 200) and time.monotonic() < deadline:
+    while (
+        not (journal.exists() and journal.read_bytes().count(b'"row"') > 200)
+        and campaign.poll() is None
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.01)
     campaign.send_signal(signal.SIGKILL)
     campaign.wait()

@@ -236,7 +236,11 @@ def test_an_interrupt_keeps_the_rows_and_says_how_to_go_on(tmp_path: Path, toy_p
     ]
     campaign = subprocess.Popen(command, env=environment(toy_package), stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not (out.exists() and (out / "journal.jsonl").stat().st_size > 20_000) and time.monotonic() < deadline:
+    while (
+        not (out.exists() and (out / "journal.jsonl").stat().st_size > 20_000)
+        and campaign.poll() is None
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.01)
     campaign.send_signal(signal.SIGINT)
     _, errors = campaign.communicate(timeout=30)
