@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from problems import registry
-from problems.errors import DefinitionError, FormError, SettingError
+from problems.errors import DefinitionError, FormError, SettingError, UnknownNameError
 from problems.forms.affine import require_affine
 from problems.forms.quadratic import QuadraticProgram
 from problems.problem import Problem
@@ -48,9 +48,13 @@ def _session(
     auto = solver == "auto"
     if auto and (form == "quadratic" or (form is None and is_affine(problem))):
         return _quadratic(problem, solver, None, eliminate, settings)
-    entry = registry.load("solvers", "gauss-newton" if auto else solver.partition(":")[0])
-    if ":" in solver:
-        entry = entry(solver.partition(":")[2])
+    name, _, inner = solver.partition(":")
+    entry = registry.load("solvers", "gauss-newton" if auto else name)
+    # what takes a name after the colon is a function, or a class that says so
+    if getattr(entry, "named", not isinstance(entry, type)):
+        entry = entry(inner)
+    elif inner:
+        raise UnknownNameError("solver", solver, registry.names("solvers"))
     forms = getattr(entry, "forms", ("quadratic",))
     chosen = form or forms[0]
     if chosen not in forms:

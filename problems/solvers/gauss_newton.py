@@ -21,6 +21,7 @@ from problems.problem import Problem
 from problems.solvers.base import Options, Status
 from problems.solvers.least_squares_solution import LeastSquaresCheck
 from problems.solvers.linear import SingularError, factorization
+from problems.solvers.optimality import optimality
 from problems.solvers.qp_step import QPStep
 from problems.solvers.session import Session, Solution
 from problems.solvers.settings import read_settings
@@ -37,11 +38,14 @@ class Settings:
         qp_solver: QP backend for inequalities; by default daqp for small problems and proxqp for large ones.
         whole: one compiled function for the whole problem (True), array code (False), or by size (None).
         iterations: exact number of steps without convergence test (real-time iteration); None iterates to convergence.
+        screen: answer steps that satisfy the linearized constraints by the linear solve; else the QP backend is always
+            called.
     """
 
     qp_solver: str | None = None
     whole: bool | None = None
     iterations: int | None = None
+    screen: bool = True
 
 
 class GaussNewton(Session):
@@ -103,9 +107,10 @@ class GaussNewton(Session):
         else:
             search = _Search(self, bound, prepared[0])
             status, message = search.feedback(prepared[1])
-        check = LeastSquaresCheck(
-            self.form_, self.constraints, self.pins, bound, search.point, search.multipliers
-        )
+        if search.doubtful and status is Status.SOLVED:
+            found = optimality(self.form_, self.constraints, self.pins, bound, search.point, search.multipliers)
+            status, message = found.judge(status, message, self.options)
+        check = LeastSquaresCheck(self.form_, self.constraints, self.pins, bound, search.point, search.multipliers)
         return Solution(self.layout, search.point, status, self.solver, check, search.iterations, message)
 
 
@@ -120,8 +125,9 @@ class _Search:
         self.iterations = 0
         self.multipliers: np.ndarray | None = None
         self.penalty = 0.0
+        self.doubtful = False  # the last step was no exact one, so its decrease is no test of convergence
         self.numbers = bound.numbers
-        if session.constraints.size:
+        if session.constraints.size or not session.settings.screen:
             self.lower, self.upper = session.constraints.bounds(bound.numbers, bound.flags)
 
     def run(self) -> tuple[Status, str]:
@@ -171,11 +177,13 @@ class _Search:
             if self.damping > 0:
                 damped = hessian.copy()
                 damped[self.diagonal] += self.damping * np.maximum(hessian[self.diagonal], 1e-12)
+            step = np.full(gradient.size, np.nan)
             try:
-                session._linear.factor(damped)
-                step = -session._linear.solve(gradient)
-                if not np.isfinite(step).all():
-                    raise SingularError("no finite step")
+                if session.settings.screen:
+                    session._linear.factor(damped)
+                    step = -session._linear.solve(gradient)
+                    if not np.isfinite(step).all():
+                        raise SingularError("no finite step")
             except SingularError as error:
                 if self.damping == 0 and not session.constraints.size:
                     free = self._free(hessian)
@@ -185,7 +193,7 @@ class _Search:
                     return Status.FAILED, f"no step found: {error}"
                 continue
             failed = None
-            if session.constraints.size:
+            if session.constraints.size or not session.settings.screen:
                 failed, step = self._constrained(step, gradient, damped)
                 if failed is not None:
                     return failed
@@ -219,17 +227,20 @@ class _Search:
     def _constrained(
         self, step: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
     ) -> tuple[tuple[Status, str] | None, np.ndarray]:
-        """The step that satisfies the linearized constraints; the free one where it does already."""
+        """The step that satisfies the linearized constraints; the free one where it does already and is asked for."""
         constraints = self.session.constraints
         values, entries = constraints.evaluate(self.point, self.numbers)
         rows = values + np.bincount(constraints.rows, entries * step[constraints.columns], constraints.size)
-        if ((rows <= self.upper + self.options.tolerance) & (rows >= self.lower - self.options.tolerance)).all():
+        inside = (rows <= self.upper + self.options.tolerance) & (rows >= self.lower - self.options.tolerance)
+        if self.session.settings.screen and inside.all():
             self.multipliers = np.zeros(constraints.size)
+            self.doubtful = False
             return None, step
         result, status = self.session._step.solve(hessian, gradient, entries, self.lower - values, self.upper - values)
         if result.x is None or result.y is None or status not in (Status.SOLVED, Status.INACCURATE):
             return (status, f"QP step: {result.message or status}"), step
         self.multipliers = result.y
+        self.doubtful = status is not Status.SOLVED
         return None, result.x
 
     def _curvature(self, hessian: np.ndarray, step: np.ndarray) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from problems import registry
+from problems.errors import FormError
 from problems.forms.least_squares import Constraints
 from problems.forms.pins import Pins
 from problems.forms.sparsity import HessianPattern
@@ -15,6 +16,22 @@ from problems.solvers.base import Options, QPBackend, QPResult, Status
 from problems.solvers.qp_check import judge
 
 DENSE_SIZE = 150
+
+
+def qp_backend(name: str) -> type[QPBackend]:
+    """The QP backend registered as `name`, also ``qpsolvers:NAME``.
+
+    Raises:
+        FormError: what is registered under that name takes no quadratic programs.
+        UnknownNameError, MissingExtraError: nothing is; its package is not installed.
+    """
+    outer, _, inner = name.partition(":")
+    backend = registry.load("solvers", outer)
+    if inner:
+        backend = backend(inner)
+    if hasattr(backend, "forms"):
+        raise FormError(f"solver {name!r} is no QP backend; it takes the form {' or '.join(backend.forms)}")
+    return backend
 
 
 class QPStep:
@@ -29,12 +46,14 @@ class QPStep:
         self._backend: QPBackend | None = None
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         shape = (constraints.size, pattern.size)
-        rows, cols = constraints.rows, constraints.columns
+        rows, cols = constraints.rows.astype(np.int32), constraints.columns.astype(np.int32)
         keep = ~np.isin(cols, pins.columns)
         self._keep = None if keep.all() else keep
         self._shape, self._rows, self._cols = shape, rows, cols
         upper = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._upper = (pattern.indices, upper)
+        # some backends take 32-bit indices only
+        self._half = (pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32))
 
     def solve(
         self, hessian: np.ndarray, gradient: np.ndarray, entries: np.ndarray, l: np.ndarray, u: np.ndarray
@@ -45,7 +64,7 @@ class QPStep:
         P, A = self._matrices(hessian, entries)
         try:
             if self._backend is None:
-                backend = registry.load("solvers", self._solver)
+                backend = qp_backend(self._solver)
                 self._dense = backend.dense
                 P, A = self._matrices(hessian, entries)
                 self._backend = backend(P, gradient, A, l, u, self._options)
@@ -69,7 +88,7 @@ class QPStep:
             P[self._upper[1], self._upper[0]] = hessian
             flat = np.bincount(self._rows * n + self._cols, entries, self._shape[0] * n)
             return P, flat.reshape(self._shape)
-        half = sp.csc_array((hessian, self._pattern.indices, self._pattern.indptr), shape=(n, n))
+        half = sp.csc_array((hessian, *self._half), shape=(n, n))
         diagonal = sp.diags_array(hessian[self._pattern.diagonal])
         P = sp.csc_array(half + half.T - diagonal)
         A = sp.csc_array(sp.coo_array((entries, (self._rows, self._cols)), shape=self._shape))
