@@ -321,9 +321,11 @@ class Problem:
 
     def _add(self, term: Term) -> Term:
         from problems.forms.layout import check_numbers
+        from problems.forms.residual_code import require_known_operations
         from problems.forms.template import template_of
 
         check_numbers(term, template_of(term).dim)
+        require_known_operations(term)
         self.terms[term.name] = term
         return term
 

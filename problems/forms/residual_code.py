@@ -66,7 +66,9 @@ _UNARY = {
     ca.OP_INV: "np.reciprocal",
     ca.OP_LOG1P: "np.log1p",
     ca.OP_EXPM1: "np.expm1",
+    ca.OP_ERF: "special.erf",
 }
+_OTHER = (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_ASSIGN, ca.OP_TWICE, ca.OP_IF_ELSE_ZERO)
 
 
 class ArrayCode:
@@ -142,10 +144,8 @@ def _generate(function: ca.Function, arrays: tuple[bool, ...]) -> Callable[..., 
             expression = f"np.where({names[0]}, {names[1]}, 0.0)"
         elif op in _BINARY:
             expression = f"{_BINARY[op]}({names[0]}, {names[1]}"
-        elif op in _UNARY:
-            expression = f"{_UNARY[op]}({names[0]}"
         else:
-            raise DefinitionError(f"the residual uses CasADi operation {op}, which array code does not know")
+            expression = f"{_UNARY[op]}({names[0]}"
         if any(is_array for _, is_array in operands):
             buffers.add(register)
             target = f"b{register}"
@@ -163,6 +163,10 @@ def _generate(function: ca.Function, arrays: tuple[bool, ...]) -> Callable[..., 
         *(f"        {line}" for line in views + body),
     ]
     scope: dict[str, Any] = {"np": np}
+    if any("special." in line for line in lines):
+        from scipy import special
+
+        scope["special"] = special
     exec(compile("\n".join(lines), "<residual code>", "exec"), scope)  # noqa: S102
     return scope["run"]
 
@@ -188,6 +192,21 @@ class ResidualCode:
         out = self._both(values, count)
         dim, width = self.template.dim, self.template.width
         return out[:dim].T, out[dim:].reshape(width, dim, count).transpose(2, 1, 0)
+
+
+def require_known_operations(term: Term) -> None:
+    """Raises DefinitionError naming the term and the operations that have no array code."""
+    unknown = _unknown_operations(template_of(term))
+    if unknown:
+        raise DefinitionError(f"{term.what}: the residual uses {', '.join(unknown)}, which array code does not know")
+
+
+@lru_cache(maxsize=1024)
+def _unknown_operations(template: Template) -> tuple[str, ...]:
+    function = ca.Function("r", [template.point, template.numbers], [template.residual])
+    used = {function.instruction_id(k) for k in range(function.n_instructions())}
+    names = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
+    return tuple(names[op] for op in sorted(used.difference(_BINARY, _UNARY, _OTHER)))
 
 
 @lru_cache(maxsize=1024)
