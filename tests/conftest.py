@@ -44,7 +44,7 @@ class ToySettings(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid")
     steps: int = pydantic.Field(default=4, ge=1, description="number of steps")
     tolerance: float = pydantic.Field(default=1e-6, gt=0)
-    mode: Literal["calm", "raise", "exit", "crash", "hang", "print", "warn"] = "calm"
+    mode: Literal["calm", "raise", "exit", "crash", "hang", "print", "warn", "unpicklable"] = "calm"
     offset: float = 0.0
     label: str = "1"
 
@@ -84,7 +84,7 @@ class Toy:
             status=Counter(solved=settings.steps - 1, inaccurate=1),
             iterations=3,
             residual=settings.tolerance / 2,
-            trace=drawn,
+            trace=(lambda: drawn) if (settings.mode, method) == ("unpicklable", "first") else drawn,
         )
 
     def plot(self, settings, drawn, outcomes):

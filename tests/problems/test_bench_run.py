@@ -42,10 +42,10 @@ def test_the_noise_of_a_trial_depends_on_seed_scenario_and_trial_only() -> None:
 
 def test_methods_solvers_and_settings_of_a_trial_meet_the_same_noise() -> None:
     jobs = plan(trials=1, solvers=("swift", "slow"), settings={"tolerance": [1e-3, 1e-6]}).jobs()
-    outcomes = [outcome for _, outcome in run_jobs(jobs, workers=0, keep=[job.key for job in jobs])]
-    assert len(outcomes) == 10
-    assert all(isinstance(outcome, Outcome) for outcome in outcomes)
-    assert all(np.array_equal(outcome.trace, outcomes[0].trace) for outcome in outcomes if outcome)
+    kept = [outcome for _, outcome in run_jobs(jobs, workers=0, keep=[job.key for job in jobs])]
+    traces = [outcome.trace for outcome in kept if outcome is not None]
+    assert len(traces) == len(kept) == 10
+    assert all(np.array_equal(trace, traces[0]) for trace in traces)
 
 
 def test_a_row_holds_what_the_scenario_reported() -> None:
@@ -130,6 +130,15 @@ def test_only_the_outcomes_that_are_wanted_cross_the_process_boundary() -> None:
     assert kept[0] is not None
     assert np.array_equal(kept[0].trace, trial_rng(0, "toy", 0).normal(size=4))
     assert kept[1] is None
+
+
+@pytest.mark.serial
+def test_an_outcome_that_cannot_be_sent_is_a_failure_of_its_row() -> None:
+    jobs = plan(trials=1, settings={"mode": "unpicklable"}).jobs()
+    rows = {row.job.method: row for row, _ in run_jobs(jobs, workers=1, keep=[job.key for job in jobs])}
+    assert rows["mean"].failure is None
+    assert rows["first"].failure is not None
+    assert "pickle" in rows["first"].failure.message
 
 
 @pytest.mark.serial

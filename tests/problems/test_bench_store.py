@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -50,7 +51,7 @@ def test_parquet_gives_back_the_rows_of_the_journal(tmp_path: Path) -> None:
 def test_the_table_is_fit_for_pandas(tmp_path: Path) -> None:
     rows = filled(tmp_path)
     load(tmp_path)
-    frame = pd.read_parquet(tmp_path / "rows.parquet")
+    frame: Any = pd.read_parquet(tmp_path / "rows.parquet")
     good = [row for row in rows if row.failure is None and row.job.scenario == "toy"]
     mean = frame[frame["failure.kind"].isna() & (frame.scenario == "toy")]["metrics.error"].mean()
     assert mean == pytest.approx(sum(row.metrics["error"] or 0.0 for row in good) / len(good))

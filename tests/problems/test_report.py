@@ -93,7 +93,7 @@ class Page(html.parser.HTMLParser):
 
 
 def test_every_number_of_the_results_table_follows_from_parquet(folder: Path, results: Results) -> None:
-    frame = pd.read_parquet(folder / "rows.parquet")
+    frame: Any = pd.read_parquet(folder / "rows.parquet")
     frame = frame[frame.scenario == "toy"]
     frame["tolerance"] = [json.loads(text)["tolerance"] for text in frame.settings]
     frame["mode"] = [json.loads(text)["mode"] for text in frame.settings]
@@ -175,7 +175,7 @@ def test_points_carry_what_filters_look_for(results: Results) -> None:
 def test_the_picture_joins_the_tolerances_of_one_method_and_solver(results: Results) -> None:
     summaries = [s for s in summarize(results.rows) if s.scenario == "toy" and s.settings["mode"] == "calm"]
     figure = plots.accuracy_against_time(summaries, "error", "p")
-    axes = figure.axes[0]
+    axes: Any = figure.axes[0]
     lines = [line for line in axes.lines if "-line-" in (line.get_gid() or "")]
     assert len(lines) == 5
     for line in lines:
