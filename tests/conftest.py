@@ -38,13 +38,14 @@ import numpy as np
 import pydantic
 
 from problems.bench.scenario import Outcome
+from problems.errors import ReadError
 
 
 class ToySettings(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid")
     steps: int = pydantic.Field(default=4, ge=1, description="number of steps")
     tolerance: float = pydantic.Field(default=1e-6, gt=0)
-    mode: Literal["calm", "raise", "exit", "crash", "hang", "print", "warn", "unpicklable"] = "calm"
+    mode: Literal["calm", "raise", "exit", "crash", "hang", "print", "warn", "unpicklable", "unreadable"] = "calm"
     offset: float = 0.0
     label: str = "1"
 
@@ -58,6 +59,8 @@ class Toy:
     without_solver = ("kalman",)
 
     def draw(self, settings, rng):
+        if settings.mode == "unreadable":
+            raise ReadError("some/file.csv", 3, "a number", "'x'")
         return rng.normal(size=settings.steps)
 
     def run(self, settings, method, solver, drawn):

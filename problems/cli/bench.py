@@ -53,12 +53,11 @@ def bench(
         give(to_json(summaries, facts, plan.trials, values))
         if not as_json:
             print_summaries(summaries)
-        failed = print_failures(rows, lambda job: facts[job.scenario]["settings"])
+        code = print_failures(rows, lambda job: facts[job.scenario]["settings"])
         error_console().print(
             f"results in {out}; horizonet report {out} --html FILE makes a page of them", soft_wrap=True
         )
-    if failed:
-        raise typer.Exit(1)
+    raise typer.Exit(code)
 
 
 def _plan(what: list[str], methods: list[str], solvers: list[str], values: dict[str, list[str]]) -> Plan:

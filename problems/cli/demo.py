@@ -27,7 +27,6 @@ def demo(
     rows = run_campaign(built_in_plan(PLAN), out, workers=1, fresh=True)
     results = load(out)
     print_summaries(summarize(rows))
-    failed = print_failures(rows, lambda job: results.scenarios[job.scenario]["settings"])
+    code = print_failures(rows, lambda job: results.scenarios[job.scenario]["settings"])
     save(out / "report.html", page(results))
-    if failed:
-        raise typer.Exit(1)
+    raise typer.Exit(code)

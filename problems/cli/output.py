@@ -14,6 +14,7 @@ from problems.bench.metrics import solved_share
 from problems.bench.rows import Job, Row
 from problems.bench.settings import as_text
 from problems.bench.summary import Summary, configuration, reproduce
+from problems.errors import ReadError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -113,7 +114,7 @@ def print_failures(rows: Iterable[Row], defaults: Callable[[Job], dict[str, Any]
         defaults: default settings of the scenario of a job.
 
     Returns:
-        The number of failed rows.
+        The exit code of the command: 0 without failures, 2 when an input could not be read, else 1.
     """
     failed = [row for row in rows if row.failure is not None]
     different = {(configuration(row.job), row.failure.message): row for row in reversed(failed) if row.failure}
@@ -124,4 +125,4 @@ def print_failures(rows: Iterable[Row], defaults: Callable[[Job], dict[str, Any]
         out.print(f"  {reproduce(row.job, defaults(row.job))}", soft_wrap=True)
     if len(different) > FAILURES_SHOWN:
         out.print(f"  and {len(different) - FAILURES_SHOWN} different failures more")
-    return len(failed)
+    return max((2 if row.failure.kind == ReadError.__name__ else 1 for row in failed if row.failure), default=0)

@@ -47,9 +47,8 @@ def run(
             print_summaries(summaries)
         if plot and outcomes:
             _draw(world, values, seed, outcomes, plot)
-        failed = print_failures(rows, lambda job: facts["settings"])
-    if failed:
-        raise typer.Exit(1)
+        code = print_failures(rows, lambda job: facts["settings"])
+    raise typer.Exit(code)
 
 
 def _run(plan: Plan, first_trial: bool) -> tuple[list[Row], dict[str, Outcome]]:

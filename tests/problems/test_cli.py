@@ -142,6 +142,13 @@ def test_failed_trials_end_with_code_1_and_keep_the_others() -> None:
 
 
 @pytest.mark.serial
+def test_an_input_that_cannot_be_read_ends_with_code_2() -> None:
+    result = horizonet("run", "toy", "--set", "mode=unreadable")
+    assert result.exit_code == 2
+    assert "some/file.csv:3: expected a number; found 'x'" in result.stderr
+
+
+@pytest.mark.serial
 def test_standard_output_is_one_json_object_whatever_estimators_print(toy_package: Path) -> None:
     command = [sys.executable, "-m", "problems.cli", "run", "toy", "--set", "mode=print", "--json"]
     done = subprocess.run(command, env=environment(toy_package), capture_output=True, text=True, check=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from problems import registry
+from problems.bench.plan import built_in_plan, built_in_plans
 from problems.errors import MissingExtraError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,7 +41,15 @@ def test_every_entry_point_loads(kind: str, name: str) -> None:
         assert loaded.methods
         assert loaded.metrics
         assert loaded.settings.model_config.get("extra") == "forbid"
-        loaded.settings()  # all settings have defaults, so that the scenario runs by its name alone
+        required = {key for key, info in loaded.settings.model_fields.items() if info.is_required()}
+        assert required <= {"path"}  # all but a recording run by their name alone
+
+
+@pytest.mark.parametrize("name", built_in_plans())
+def test_built_in_plans_name_what_exists(name: str) -> None:
+    plan = built_in_plan(name)
+    assert plan.jobs()
+    assert plan.text
 
 
 def test_extras_named_by_solvers_exist() -> None:
