@@ -6,7 +6,7 @@ T; `SparseMap` (large problems) keeps the factorized KKT system instead.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse.linalg as spla
@@ -17,6 +17,9 @@ from problems.forms.layout import DataStore
 from problems.forms.quadratic import QuadraticProgram, Reduced
 from problems.solvers.linear import FREE, factorized_kkt
 
+if TYPE_CHECKING:
+    from problems.solvers.qp_rows import StackedRows
+
 INDEPENDENT = 1e-13  # share of a Hessian diagonal left after elimination, below which a direction may be free
 
 
@@ -25,6 +28,7 @@ class DenseMap:
 
     Attributes:
         free: a direction in all unknowns that no cost sees, or None.
+        rows: the uncondensed rows with these weights, once a solution was checked.
         definite: there is an affine answer. Where only linear costs and inequalities hold an unknown (exact penalties),
             neither is it free nor is there one.
     """
@@ -33,6 +37,7 @@ class DenseMap:
         self, program: QuadraticProgram, reduced: Reduced, store: DataStore, flags: dict[str, Any], pattern: bytes
     ) -> None:
         self.reduced, self.flags = reduced, flags
+        self.rows: StackedRows | None = None
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
         inner = reduced.inner
         if inner is None:
@@ -115,6 +120,7 @@ class SparseMap:
         self, program: QuadraticProgram, reduced: Reduced, store: DataStore, flags: dict[str, Any], pattern: bytes
     ) -> None:
         self.reduced, self.flags = reduced, flags
+        self.rows: StackedRows | None = None
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
         solver, flat = factorized_kkt(self.P, reduced.A[: reduced.equalities])
         self.free, self.definite = None, flat is None

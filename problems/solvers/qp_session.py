@@ -58,9 +58,12 @@ class QPSession(Session):
         self.switching = _switching(program)
         self.slow = frozenset(n for n, speed in program.speeds.items() if speed != "vector") - self.switching
         self._switches = program.activity.switches.size > 0
+        self._watched = self.slow | self.switching
+        self._complete_key: bytes | None = None if self._switches else b""
         self._bound_numbers = _bound_positions(program)
         self._maps: dict[bytes, DenseMap | SparseMap] = {}
         self._marginals: dict[Any, AffineMarginal] = {}
+        self._last_marginal: tuple[bytes, Any, Any, AffineMarginal] | None = None
         self._backend: QPBackend | None = None
         self._loaded: DenseMap | SparseMap | None = None
         self.last: tuple[np.ndarray, np.ndarray] | None = None
@@ -80,13 +83,19 @@ class QPSession(Session):
             self._maps[b""] = map_
 
     def _set(self, name: str, value: Any) -> None:
-        if name not in self.slow:
+        if name not in self._watched:
             self.store.set(name, value)
             return
         before = self.store[name].tobytes()
         self.store.set(name, value)
         if self.store[name].tobytes() != before:
-            self._maps, self._marginals = {}, {}
+            self._changed(numbers=name in self.slow)
+
+    def _changed(self, numbers: bool) -> None:
+        """Forget what depended on the switches and, where `numbers` changed, on weights and matrices."""
+        self._complete_key = None if self._switches else b""
+        if numbers:
+            self._maps, self._marginals, self._last_marginal = {}, {}, None
 
     def _update(self) -> None:
         self._map(*self._pattern())
@@ -94,9 +103,10 @@ class QPSession(Session):
     def _pattern(self) -> tuple[bytes, np.ndarray]:
         """Key of the pattern of missing data and switches; the numbers with missing ones read as zero."""
         d = self.store.numbers
-        square = d @ d
-        if square < np.inf:
-            return (self.program.activity.key(d) if self._switches else b""), d
+        if d.dot(d) < np.inf:
+            if self._complete_key is None:
+                self._complete_key = self.program.activity.key(d)
+            return self._complete_key, d
         infinite = np.isinf(d)
         infinite[self._bound_numbers] = False
         if infinite.any():
@@ -143,12 +153,16 @@ class QPSession(Session):
     def _marginal(self, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
         """Affine in the data, so the map is kept beside the solution's and costs one product."""
         pattern, numbers = self._pattern()
+        last = self._last_marginal
+        if last is not None and last[1] is drop and last[2] is keep and last[0] == pattern:
+            return last[3](numbers, point)
         key = (pattern, _slot_key(drop), _slot_key(keep))
         found = self._marginals.get(key)
         if found is None:
             if len(self._marginals) >= MAPS:
                 self._marginals.pop(next(iter(self._marginals)))
             found = self._marginals[key] = AffineMarginal(self.program, self.store, numbers, drop, keep)
+        self._last_marginal = (pattern, drop, keep, found)
         return found(numbers, point)
 
     def batch(self, count: int) -> QPBatch:
@@ -159,7 +173,7 @@ class QPSession(Session):
         self.store.numbers[:] = numbers
         self.store.given = dict.fromkeys(self.store.given, True)
         if not same_map:
-            self._maps, self._marginals = {}, {}
+            self._changed(numbers=True)
 
     def current_map(self) -> DenseMap | SparseMap:
         """The affine map for the data given so far."""
@@ -226,7 +240,7 @@ class QPSession(Session):
 def _check(
     session: QPSession, numbers: np.ndarray, map_: Any, point: np.ndarray, mu: np.ndarray | None = None
 ) -> QPCheck:
-    return QPCheck(session.program, session.store, numbers.copy(), map_.flags, point, mu)
+    return QPCheck(session.program, session.store, numbers.copy(), map_, point, mu)
 
 
 def _slot_key(chosen: Any) -> Any:
