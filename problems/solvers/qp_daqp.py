@@ -127,6 +127,10 @@ class DAQP(Backend):
             self._stale = True
             return _without_point(flag, 0)
         x, self._value, flag, info = model.solve()
+        if warm is not None and self._value - self._value != 0.0:
+            # A row that was active has lost its bound; only a fresh workspace forgets it.
+            self._build(q, l, u)
+            return self._run(q, l, u, None)
         if flag == 1 or flag == 4:
             y = info["lam"][: self._m]
             if weight:
