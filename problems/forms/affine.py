@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
-from problems.errors import FormError, NotAffineError
+from problems.errors import DataError, FormError, NotAffineError
 from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, noise_numbers
 from problems.forms.residual_code import ArrayCode
 from problems.forms.template import Template, template_of
@@ -101,13 +101,28 @@ def _affine_code(template: Template, matrix: tuple[bool, ...]) -> _AffineCode:
 
 @dataclass(eq=False)
 class Rows:
-    """Affine rows of one term: ``R z + E d + c``, (count * dim) rows, instance after instance."""
+    """Affine rows of one term: ``R z + E d + c``, (count * dim) rows, instance after instance.
+
+    `broken` marks instances (count,) whose coefficients are not finite for the matrix data given; they read as zero.
+    """
 
     layout: TermLayout
     dim: int
     R: Matrix
     E: Matrix
     c: np.ndarray
+    broken: np.ndarray | None = None
+
+    def require_finite(self, on: np.ndarray | None) -> None:
+        """Raises DataError where an instance that is on (None: all) is broken."""
+        if self.broken is None:
+            return
+        bad = self.broken if on is None else self.broken & on
+        if bad.any():
+            raise DataError(
+                f"{self.layout.term.what}: instance {int(np.flatnonzero(bad)[0])} has coefficients that are not finite "
+                "for the data given"
+            )
 
     @property
     def count(self) -> int:
@@ -134,19 +149,25 @@ class AffineRows:
         self._constant: list[Rows | None] = [None] * len(self._parts)
 
     def evaluate(self, numbers: np.ndarray) -> list[Rows]:
-        """Rows of every term, in the order of the problem."""
+        """Rows of every term, in the order of the problem. Raises DataError for an equality that is not finite."""
         out = []
         for k, (entry, code, slow, fast) in enumerate(self._parts):
             rows = self._constant[k]
             if rows is None:
                 J, E, c = code(numbers[slow], entry.term.count)
+                broken = ~(np.isfinite(J).all((1, 2)) & np.isfinite(E).all((1, 2)) & np.isfinite(c).all(1))
+                if broken.any():
+                    J, E, c = (np.where(broken.reshape(-1, *[1] * (a.ndim - 1)), 0.0, a) for a in (J, E, c))
                 rows = Rows(
                     entry,
                     code.dim,
                     self._place(J, entry.columns, code.dim, self.layout.size),
                     self._place(E, fast, code.dim, self.layout.data_size),
                     np.broadcast_to(c, (entry.term.count, code.dim)).ravel(),
+                    np.broadcast_to(broken, entry.term.count) if broken.any() else None,
                 )
+                if entry.term.kind == "equality":
+                    rows.require_finite(None)
                 if code.constant:
                     self._constant[k] = rows
             out.append(rows)
@@ -180,9 +201,6 @@ class Bounds:
             value = getattr(r.layout.term, key)
             if isinstance(value, DataSlot):
                 index = layout.numbers(value)
-                index = np.broadcast_to(index, (r.count, index.shape[1]))
-                if index.shape[1] not in (1, r.dim):
-                    raise FormError(f"{r.layout.term.what}: {key} data have {index.shape[1]} numbers for {r.dim} rows")
                 indices.append(np.broadcast_to(index, (r.count, r.dim)).ravel())
                 constants.append(np.zeros(r.count * r.dim))
             else:

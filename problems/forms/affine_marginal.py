@@ -29,6 +29,7 @@ class AffineMarginal:
             touching = np.isin(rows.layout.columns, dropped).any(axis=1)
             if term.kind == "inequality" or not touching.any():
                 continue
+            rows.require_finite(flags[term.name])
             pick = np.flatnonzero(np.repeat(touching, rows.dim))
             R, Ed = _dense(rows.R[pick][:, involved]), np.column_stack([_dense(rows.E[pick]), rows.c[pick]])
             if term.kind == "equality":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,20 @@ class Layout:
         self.data_size = numbers
         self.terms = [self._term(term) for term in problem.terms.values()]
 
+    @cached_property
+    def bound_numbers(self) -> np.ndarray:
+        """Positions of data that are bounds and nothing else, the only ones that may be infinite."""
+        bounds, others = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+        for term in (entry.term for entry in self.terms):
+            weights = term.noise.value if term.noise else None
+            bounds += [self.numbers(v).ravel() for v in (term.lower, term.upper) if isinstance(v, DataSlot)]
+            others += [
+                self.numbers(v).ravel()
+                for v in (*term.data, weights, term.linear, term.active)
+                if isinstance(v, DataSlot)
+            ]
+        return np.setdiff1d(np.concatenate(bounds), np.concatenate(others))
+
     def columns(self, slot: Slot) -> np.ndarray:
         """(instances, dim) positions of a slot's tangent coordinates."""
         dim = slot.source.space.dim
@@ -291,6 +306,15 @@ class DataStore:
     def __getitem__(self, name: str) -> np.ndarray:
         """(rows, size) view of the numbers of `name`."""
         return self._views[name]
+
+    def require_finite(self) -> None:
+        """Raises DataError naming data that are infinite and more than a bound."""
+        infinite = np.isinf(self.numbers)
+        infinite[self.layout.bound_numbers] = False
+        if infinite.any():
+            at = int(np.flatnonzero(infinite)[0])
+            name = max((start, name) for name, start in self.layout.data_start.items() if start <= at)[1]
+            raise DataError(f"data {name!r} have an infinite value; only bounds may be infinite")
 
     def require_all(self) -> None:
         """Raises DataError naming data that were never given."""

@@ -11,7 +11,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from problems.errors import DataError
 from problems.forms.kernels import CostKernel, cost_kernel
 from problems.forms.layout import Activity, DataStore, Layout, TermLayout, constant_rows, noise_numbers
 from problems.forms.residual_code import residual_code
@@ -90,12 +89,7 @@ class LeastSquares:
     def bind(self, store: DataStore) -> Bound:
         """Costs as functions of the point alone, for the data in `store`."""
         flags = self.activity.flags(store.numbers)
-        if np.isinf(store.numbers).any():
-            bounds = _bound_numbers(self.layout)
-            bad = np.isinf(store.numbers)
-            bad[bounds] = False
-            if bad.any():
-                raise DataError("data have an infinite value outside of bounds")
+        store.require_finite()
         by_name = {e.term.name: f for e, f in zip(self.layout.terms, flags, strict=True)}
         return (WholeBound if self.whole else ArrayBound)(self, store, by_name)
 
@@ -320,10 +314,3 @@ class Constraints:
                 off = np.repeat(~on, d)
                 lower[part][off], upper[part][off] = -np.inf, np.inf
         return lower, upper
-
-
-def _bound_numbers(layout: Layout) -> np.ndarray:
-    found = [
-        layout.numbers(v).ravel() for e in layout.terms for v in (e.term.lower, e.term.upper) if isinstance(v, DataSlot)
-    ]
-    return np.concatenate(found) if found else np.zeros(0, np.intp)

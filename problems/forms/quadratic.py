@@ -114,7 +114,12 @@ class Reduced:
         """P, and Q, q0 with ``q = Q d + q0``, for the weights and the active instances of `store`.
 
         `pattern` identifies `flags`; what constant weights contribute is kept per pattern.
+
+        Raises:
+            DataError, NoiseError: coefficients or weights of an active instance that cannot be used; names the term.
         """
+        for rows in self._original:
+            rows.require_finite(flags.get(rows.layout.term.name))
         fixed = self._constants.get(pattern)
         if fixed is None:
             parts = [_contribution(t, store, flags.get(t.name)) for t in self.costs if t.constant]
@@ -162,8 +167,6 @@ def _cost(rows: Rows, map_: AffineMap) -> CostTerm:
     if isinstance(term.linear, DataSlot):
         index = rows.layout.linear
         assert index is not None
-        if index.shape[1] not in (1, rows.dim):
-            raise DefinitionError(f"{term.what}: linear data have {index.shape[1]} numbers for {rows.dim} rows")
         index = np.broadcast_to(index, (term.count, rows.dim)).ravel()
         ones, at = np.ones(index.size), np.arange(index.size)
         linear_data = sp.csr_array((ones, (at, index)), shape=(index.size, rows.E.shape[1]))
