@@ -113,6 +113,9 @@ class DAQP(Backend):
         if self._no_rows:
             l, u = self._no_rows
             warm = None
+        if warm is not None and l.dot(l) + u.dot(u) == np.inf and _unbounded(warm[1], l, u):
+            # The library would keep a row active at a bound that is gone.
+            warm = None
         if warm is None:
             sense = self._cold
         elif warm[1] is self._last_y:
@@ -127,10 +130,6 @@ class DAQP(Backend):
             self._stale = True
             return _without_point(flag, 0)
         x, self._value, flag, info = model.solve()
-        if warm is not None and self._value - self._value != 0.0:
-            # A row that was active has lost its bound; only a fresh workspace forgets it.
-            self._build(q, l, u)
-            return self._run(q, l, u, None)
         if flag == 1 or flag == 4:
             y = info["lam"][: self._m]
             if weight:
@@ -158,6 +157,11 @@ class DAQP(Backend):
 def _without_point(flag: int, iterations: int) -> QPResult:
     status, message = _STATUS.get(flag, (Status.FAILED, f"flag {flag}"))
     return QPResult(None, None, status, iterations, message)
+
+
+def _unbounded(y: np.ndarray, l: np.ndarray, u: np.ndarray) -> bool:
+    """Whether a multiplier belongs to a side without a bound."""
+    return bool((((y > 0) & (u == np.inf)) | ((y < 0) & (l == -np.inf))).any())
 
 
 def _leading_identity(A: np.ndarray) -> int:
