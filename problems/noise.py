@@ -88,6 +88,15 @@ def _array(value: Any, kind: Kind, what: str) -> np.ndarray:
         raise NoiseError(f"{what}: {kind} must be numbers, got {value!r}") from None
 
 
+def chosen_rows(noise: Gaussian, dim: int, count: int, rows: np.ndarray, what: str) -> Gaussian:
+    """The noise of chosen instances of a term with `count` instances. Errors as for `whitening`."""
+    kind = noise.kind
+    array = (
+        _sigmas(noise.value, dim, count, what) if kind == "sigma" else _matrices(kind, noise.value, dim, count, what)
+    )
+    return Gaussian(**{kind: array if array.shape[0] == 1 else array[rows]})
+
+
 def _sigmas(value: Any, dim: int, count: int, what: str) -> np.ndarray:
     array = _array(value, "sigma", what)
     if array.ndim == 0 or array.size == 1:

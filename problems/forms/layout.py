@@ -191,7 +191,8 @@ class Layout:
         size = slot.source.size
         return self.data_start[slot.source.name] + slot.indices[:, None] * size + np.arange(size)
 
-    def _stored(self, slot: Slot) -> np.ndarray:
+    def stored(self, slot: Slot) -> np.ndarray:
+        """(instances, ambient) positions of a slot's stored coordinates."""
         ambient = slot.source.space.ambient
         return self.stored_start[slot.source.name] + slot.indices[:, None] * ambient + np.arange(ambient)
 
@@ -203,7 +204,7 @@ class Layout:
 
         return TermLayout(
             term,
-            rows([self._stored(s) for s in term.slots]),
+            rows([self.stored(s) for s in term.slots]),
             rows([self.columns(s) for s in term.slots]),
             rows([self.block_start[s.source.name] + s.indices[:, None] for s in term.slots]),
             rows([self.numbers(s) for s in term.data]),

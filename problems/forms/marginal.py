@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from problems.errors import DefinitionError, UnobservableError
-from problems.forms.layout import Activity, DataStore, Layout, constant_rows
-from problems.forms.least_squares import whitening_numbers
-from problems.forms.residual_code import residual_code
-from problems.forms.selection import columns_of, slots_of
-from problems.forms.template import template_of
-from problems.problem import DataSlot, Problem, Slot
+from problems.forms.layout import DataStore, Layout
+from problems.forms.least_squares import Constraints, LeastSquares
+from problems.forms.selection import slots_of
+from problems.forms.subproblem import Subproblem
+from problems.problem import Slot
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,38 +35,6 @@ class Marginal:
     information: np.ndarray
     vector: np.ndarray
     reference: tuple[np.ndarray, ...]
-
-
-def selection(layout: Layout, drop: Any, keep: Any) -> tuple[np.ndarray, list[Slot], np.ndarray]:
-    """Columns dropped, slots kept, their columns.
-
-    Kept are the slots in `keep`, or all instances that share a cost or equality with a dropped one.
-
-    Raises:
-        DefinitionError: `keep` leaves out an instance that shares a term with a dropped one, or names one twice.
-    """
-    dropped = np.unique(columns_of(layout, drop, "marginal"))
-    touched = []
-    for entry in layout.terms:
-        if entry.term.kind in ("cost", "equality"):
-            rows = np.isin(entry.columns, dropped).any(axis=1)
-            touched.append(entry.columns[rows].ravel())
-    shared = np.setdiff1d(np.concatenate(touched) if touched else np.zeros(0, np.intp), dropped)
-    if keep is None:
-        slots = []
-        for variable in layout.problem.unknowns.values():
-            start, dim = layout.start[variable.name], variable.space.dim
-            inside = shared[(shared >= start) & (shared < start + variable.count * dim)]
-            if inside.size:
-                slots.append(variable[np.unique((inside - start) // dim)])
-    else:
-        slots = slots_of(layout, keep, "marginal")
-    columns = np.concatenate([layout.columns(s).ravel() for s in slots]) if slots else np.zeros(0, np.intp)
-    if np.setdiff1d(shared, columns).size:
-        raise DefinitionError("marginal: `keep` leaves out variables that share a cost or equality with dropped ones")
-    if np.unique(np.concatenate([dropped, columns])).size < dropped.size + columns.size:
-        raise DefinitionError("marginal: `keep` names an instance twice, or one that is dropped")
-    return dropped, slots, columns
 
 
 def schur(H: np.ndarray, G: np.ndarray, F: np.ndarray, E: np.ndarray, drop: int) -> tuple[np.ndarray, np.ndarray]:
@@ -95,63 +63,96 @@ def schur(H: np.ndarray, G: np.ndarray, F: np.ndarray, E: np.ndarray, drop: int)
     return (M + M.T) / 2, G[drop:] - cross.T @ solved[:, k:]
 
 
-def marginal(problem: Problem, layout: Layout, store: DataStore, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
-    """The marginal linearized at `point` (robust weights included). See `Session.marginal`."""
-    dropped, slots, kept = selection(layout, drop, keep)
-    involved = np.concatenate([dropped, kept])
-    place = np.full(layout.size, -1, np.intp)
-    place[involved] = np.arange(involved.size)
-    H, g = np.zeros((involved.size, involved.size)), np.zeros(involved.size)
-    F, f = [np.zeros((0, involved.size))], [np.zeros(0)]
-    numbers = np.where(np.isnan(store.numbers), 0.0, store.numbers)
-    flags = Activity(layout).flags(store.numbers)
-    for entry, on in zip(layout.terms, flags, strict=True):
-        term = entry.term
-        if term.kind == "inequality":
-            continue
-        touching = np.isin(entry.columns, dropped).any(axis=1)
-        rows = np.flatnonzero(touching if on is None else touching & on)
-        if not rows.size:
-            continue
-        inputs = [*point[entry.stored[rows]].T, *numbers[entry.numbers[rows]].T]
-        r, J = residual_code(term).residual_and_jacobian([np.ascontiguousarray(v) for v in inputs], rows.size)
-        at = place[entry.columns[rows]]
-        if term.kind == "equality":
-            for k in range(rows.size):
-                full = np.zeros((r.shape[1], involved.size))
-                np.add.at(full.T, at[k], J[k].T)
-                F.append(full)
-                f.append(r[k])
-            continue
-        white = whitening_numbers(entry, template_of(term).dim, store)
-        for k, row in enumerate(rows):
-            U = _factor(white[:, row if white.shape[1] > 1 else 0], r.shape[1])
-            e, Je = U @ r[k], U @ J[k]
-            w = float(term.loss.weight(float(e @ e)))
-            np.add.at(H, (at[k][:, None], at[k][None]), w * Je.T @ Je)
-            np.add.at(
-                g, at[k], w * Je.T @ e + J[k].T @ _linear(layout, entry.linear, term, numbers, int(row), r.shape[1])
-            )
-    M, gradient = schur(H, g[:, None], np.vstack(F), np.concatenate(f)[:, None], dropped.size)
-    reference = tuple(_stored(layout, point, slot) for slot in slots)
-    return Marginal(tuple(slots), M, -gradient[:, 0], reference)
+class MarginalPlan:
+    """What of a marginal does not depend on data or point: which instances leave, which stay, and the part of the
+    problem between them.
+
+    Attributes:
+        part: the terms that touch a dropped instance, as a problem of their own.
+        slots: the kept slots of the whole problem.
+        drop: number of dropped tangent coordinates; they come first in `columns`, the kept ones after them.
+        columns: tangent positions in the part.
+
+    Raises:
+        DefinitionError: `keep` leaves out an instance that shares a term with a dropped one, or names one twice.
+    """
+
+    def __init__(self, layout: Layout, drop: Any, keep: Any) -> None:
+        dropped_slots = slots_of(layout, drop, "marginal")
+        dropped = np.unique(_blocks(layout, dropped_slots))
+        shared = np.setdiff1d(_shared(layout, dropped), dropped)
+        if keep is None:
+            self.slots = _as_slots(layout, shared)
+        else:
+            self.slots = slots_of(layout, keep, "marginal")
+        kept = _blocks(layout, self.slots)
+        if np.setdiff1d(shared, kept).size:
+            raise DefinitionError("marginal: `keep` leaves out variables that share a term with dropped ones")
+        if np.unique(np.concatenate([dropped, kept])).size < dropped.size + kept.size:
+            raise DefinitionError("marginal: `keep` names an instance twice, or one that is dropped")
+        self.part = Subproblem(layout, dropped, kept)
+        drop_columns = np.concatenate([self.part.columns(slot) for slot in _as_slots(layout, dropped)])
+        keep_columns = [self.part.columns(slot) for slot in self.slots]
+        self.drop = drop_columns.size
+        self.columns = np.concatenate([drop_columns, *keep_columns])
+        self._values = [layout.stored(slot) for slot in self.slots]
+
+    def references(self, point: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Stored coordinates of the kept slots at a point of the whole problem."""
+        return tuple(point[index] for index in self._values)
 
 
-def _stored(layout: Layout, point: np.ndarray, slot: Slot) -> np.ndarray:
-    return layout.value(point, slot.source.name)[slot.indices]
+def _blocks(layout: Layout, slots: list[Slot]) -> np.ndarray:
+    """Numbers of the variable instances of slots."""
+    parts = [layout.block_start[slot.source.name] + slot.indices for slot in slots]
+    return np.concatenate(parts) if parts else np.zeros(0, np.intp)
 
 
-def _factor(numbers: np.ndarray, dim: int) -> np.ndarray:
-    if numbers.size == dim:
-        return np.diag(numbers)
-    U = np.zeros((dim, dim))
-    U[np.triu_indices(dim)] = numbers
-    return U
+def _shared(layout: Layout, dropped: np.ndarray) -> np.ndarray:
+    """Instances that share a cost or equality with a dropped one."""
+    mask = np.zeros(layout.block_dims.size, bool)
+    mask[dropped] = True
+    found = [dropped]
+    for entry in layout.terms:
+        if entry.term.kind != "inequality":
+            found.append(entry.blocks[mask[entry.blocks].any(axis=1)].ravel())
+    return np.unique(np.concatenate(found))
 
 
-def _linear(layout: Layout, index: Any, term: Any, numbers: np.ndarray, row: int, dim: int) -> np.ndarray:
-    if term.linear is None:
-        return np.zeros(dim)
-    if isinstance(term.linear, DataSlot):
-        return np.broadcast_to(numbers[index], (term.count, dim))[row]
-    return constant_rows(term.linear, dim, term.count, term.what)[row]
+def _as_slots(layout: Layout, blocks: np.ndarray) -> list[Slot]:
+    slots = []
+    for variable in layout.problem.unknowns.values():
+        start = layout.block_start[variable.name]
+        inside = blocks[(blocks >= start) & (blocks < start + variable.count)] - start
+        if inside.size:
+            slots.append(variable[inside])
+    return slots
+
+
+class NonlinearMarginal:
+    """Marginals linearized at a point, robust weights included; made once for each choice of `drop` and `keep`."""
+
+    def __init__(self, layout: Layout, drop: Any, keep: Any) -> None:
+        self.plan = MarginalPlan(layout, drop, keep)
+        part = self.plan.part
+        self._form = LeastSquares(part.problem, part.layout)
+        self._constraints = Constraints(part.layout)
+        pattern, size = self._form.pattern, part.layout.size
+        rows, columns = pattern.indices, np.repeat(np.arange(size), np.diff(pattern.indptr))
+        self._upper, self._lower = rows * size + columns, columns * size + rows
+
+    def __call__(self, store: DataStore, point: np.ndarray) -> Marginal:
+        plan, size = self.plan, self.plan.part.layout.size
+        bound = self._form.bind(store)
+        at = point[plan.part.stored]
+        _, gradient, entries = bound.linearize(at)
+        H = np.zeros(size * size)
+        H[self._upper] = H[self._lower] = entries
+        order = plan.columns
+        values, jacobian = self._constraints.evaluate(at, bound.numbers)
+        shape = (self._constraints.size, size)
+        F = sp.coo_array((jacobian, (self._constraints.rows, self._constraints.columns)), shape=shape).toarray()
+        M, linear = schur(
+            H.reshape(size, size)[np.ix_(order, order)], gradient[order, None], F[:, order], values[:, None], plan.drop
+        )
+        return Marginal(tuple(plan.slots), M, -linear[:, 0], plan.references(point))

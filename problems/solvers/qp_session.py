@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from problems.errors import DataError, MissingExtraError, SettingError
-from problems.forms.affine_marginal import AffineMarginal
+from problems.forms.affine_marginal import AffineMarginal, AffineMarginalPlan
 from problems.forms.marginal import Marginal
 from problems.forms.quadratic import QuadraticProgram, clean
-from problems.problem import DataSlot, Slot
+from problems.problem import DataSlot
 from problems.solvers.base import Options, QPBackend, QPResult, Status
 from problems.solvers.batch import QPBatch
 from problems.solvers.qp_check import judge
 from problems.solvers.qp_maps import DenseMap, SparseMap, require_observable
 from problems.solvers.qp_solution import QPCheck
-from problems.solvers.session import Session, Solution
+from problems.solvers.session import Session, Solution, slot_key
 
 MAPS = 64  # patterns of missing data kept between changes of weights
 
@@ -156,12 +156,13 @@ class QPSession(Session):
         last = self._last_marginal
         if last is not None and last[1] is drop and last[2] is keep and last[0] == pattern:
             return last[3](numbers, point)
-        key = (pattern, _slot_key(drop), _slot_key(keep))
+        key = (pattern, slot_key(drop), slot_key(keep))
         found = self._marginals.get(key)
         if found is None:
             if len(self._marginals) >= MAPS:
                 self._marginals.pop(next(iter(self._marginals)))
-            found = self._marginals[key] = AffineMarginal(self.program, self.store, numbers, drop, keep)
+            plan = self._plan(drop, keep, AffineMarginalPlan)
+            found = self._marginals[key] = AffineMarginal(plan, self.store, numbers)
         self._last_marginal = (pattern, drop, keep, found)
         return found(numbers, point)
 
@@ -187,8 +188,7 @@ class QPSession(Session):
 
     def _solve_qp(self, map_: DenseMap | SparseMap, numbers: np.ndarray) -> Solution:
         reduced = map_.reduced
-        q = map_.Q @ numbers + map_.q0
-        l, u = reduced.bounds(numbers, map_.flags)
+        q, l, u, offset = map_.vectors(numbers)
         result = self._call(map_, q, l, u)
         status, result = judge(result, map_.P, q, reduced.A, l, u, self.options.tolerance)
         if result.x is None or result.y is None or not np.isfinite(result.x).all():
@@ -203,7 +203,7 @@ class QPSession(Session):
                 result.iterations,
                 result.message,
             )
-        z = reduced.map.Z @ result.x + reduced.map.Y @ numbers + reduced.map.z0
+        z = reduced.map.Z @ result.x + offset
         self.last = (result.x, result.y)
         check = _check(self, numbers, map_, z, result.y[reduced.equalities :])
         return Solution(self.layout, z, status, self.solver, check, result.iterations, result.message)
@@ -241,13 +241,6 @@ def _check(
     session: QPSession, numbers: np.ndarray, map_: Any, point: np.ndarray, mu: np.ndarray | None = None
 ) -> QPCheck:
     return QPCheck(session.program, session.store, numbers.copy(), map_, point, mu)
-
-
-def _slot_key(chosen: Any) -> Any:
-    """Identity of slots; index arrays count by their content."""
-    if isinstance(chosen, (tuple, list)):
-        return tuple(_slot_key(entry) for entry in chosen)
-    return (id(chosen.source), chosen.indices.tobytes()) if isinstance(chosen, Slot) else id(chosen)
 
 
 def _switching(program: QuadraticProgram) -> frozenset[str]:

@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
 from problems.errors import DataError, FormError
 from problems.forms.layout import DataStore, Layout
+from problems.problem import Slot
 from problems.solvers.base import Options, Status
 
 if TYPE_CHECKING:
     from problems.forms.marginal import Marginal
-    from problems.problem import Problem, Slot, Variable
+    from problems.problem import Problem, Variable
     from problems.solvers.batch import BatchSession
+
+T = TypeVar("T")
 
 
 class Check(Protocol):
@@ -130,6 +133,7 @@ class Session(ABC):
         self._point: np.ndarray | None = None
         self._update_seconds = 0.0
         self._complete = False
+        self._plans: dict[Any, Any] = {}
 
     def update(self, **data: Any) -> None:
         """Take data ahead of a solve and do the work that their weights and matrices cause.
@@ -215,9 +219,16 @@ class Session(ABC):
         return self._marginal(drop, keep, point)
 
     def _marginal(self, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
-        from problems.forms.marginal import marginal
+        from problems.forms.marginal import NonlinearMarginal
 
-        return marginal(self.problem, self.layout, self.store, drop, keep, point)
+        return self._plan(drop, keep, NonlinearMarginal)(self.store, point)
+
+    def _plan(self, drop: Any, keep: Any, make: Callable[[Layout, Any, Any], T]) -> T:
+        """What a marginal can keep from call to call, made once for each choice of slots."""
+        key = (slot_key(drop), slot_key(keep))
+        if key not in self._plans:
+            self._plans[key] = make(self.layout, drop, keep)
+        return self._plans[key]
 
     def _set(self, name: str, value: Any) -> None:
         self.store.set(name, value)
@@ -230,6 +241,13 @@ class Session(ABC):
 
     def _forked(self) -> None:
         return
+
+
+def slot_key(chosen: Any) -> Any:
+    """Identity of slots; index arrays count by their content."""
+    if isinstance(chosen, (tuple, list)):
+        return tuple(slot_key(entry) for entry in chosen)
+    return (id(chosen.source), chosen.indices.tobytes()) if isinstance(chosen, Slot) else id(chosen)
 
 
 _USABLE = (Status.SOLVED, Status.INACCURATE, Status.ITERATION_LIMIT, Status.TIME_LIMIT)
