@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 INDEPENDENT = 1e-13  # share of a Hessian diagonal left after elimination, below which a direction may be free
 
+Vectors = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
 
 class DenseMap:
     """See the module; also P, Q, q0 of the quadratic program in the coordinates of `reduced`.
@@ -38,6 +40,8 @@ class DenseMap:
     ) -> None:
         self.reduced, self.flags = reduced, flags
         self.rows: StackedRows | None = None
+        self._vectors: _Vectors | None = None
+        self.size = program.layout.size
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
         inner = reduced.inner
         if inner is None:
@@ -75,7 +79,6 @@ class DenseMap:
                 constants.append(constant)
         self.T = np.ascontiguousarray(np.vstack(blocks))
         self.t = np.concatenate(constants)
-        self.size = program.layout.size
 
     def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """All unknowns (n,) and the violations of all bounds (<= 0 where they hold)."""
@@ -88,6 +91,39 @@ class DenseMap:
         out = numbers @ self.T.T
         out += self.t
         return out[:, : self.size], out[:, self.size :]
+
+    def vectors(self, numbers: np.ndarray) -> Vectors:
+        """q, l, u of the program, and the offset in ``z = Z v + offset``."""
+        if self._vectors is None:
+            self._vectors = _Vectors(self)
+        return self._vectors(numbers)
+
+
+class _Vectors:
+    """All vectors of a dense program by one product."""
+
+    def __init__(self, map_: DenseMap) -> None:
+        reduced = self._reduced = map_.reduced
+        self._flags = map_.flags
+        self._B = np.ascontiguousarray(np.vstack([map_.Q, reduced.E, reduced.map.Y]))
+        self._b = np.concatenate([map_.q0, reduced.c, reduced.map.z0])
+        self._ends = (map_.q0.size, map_.q0.size + reduced.c.size)
+        self._fixed = None
+        if not ((reduced.lower.index >= 0).any() or (reduced.upper.index >= 0).any()):
+            zero = np.zeros(reduced.E.shape[1])
+            l, u = reduced.bounds(zero, map_.flags)
+            self._fixed = l + reduced.c, u + reduced.c
+
+    def __call__(self, numbers: np.ndarray) -> Vectors:
+        out = self._B @ numbers
+        out += self._b
+        first, second = self._ends
+        if self._fixed is None:
+            l, u = self._reduced.bounds(numbers, self._flags)
+        else:
+            shift = out[first:second]
+            l, u = self._fixed[0] - shift, self._fixed[1] - shift
+        return out[:first], l, u, out[second:]
 
 
 def _flat_directions(H: np.ndarray) -> np.ndarray | None:
@@ -146,6 +182,12 @@ class SparseMap:
         """The same for many rows of numbers."""
         answers = [self(row) for row in numbers]
         return np.array([z for z, _ in answers]), np.array([excess for _, excess in answers])
+
+    def vectors(self, numbers: np.ndarray) -> Vectors:
+        """q, l, u of the program, and the offset in ``z = Z v + offset``."""
+        reduced = self.reduced
+        l, u = reduced.bounds(numbers, self.flags)
+        return self.Q @ numbers + self.q0, l, u, reduced.map.Y @ numbers + reduced.map.z0
 
 
 def require_observable(program: QuadraticProgram, free: np.ndarray) -> None:
