@@ -1,0 +1,21 @@
+"""Distributed moving horizon estimation over a network, with and without pre-estimation."""
+
+from mhe.distributed.design import NetworkDesign
+from mhe.distributed.network import DistributedEstimator, Infeasibility, NetworkEstimate
+from mhe.distributed.node import DistributedNode
+from mhe.distributed.options import METHODS, DistributedOptions, options_of
+from mhe.distributed.plan import NodePlan
+from mhe.distributed.pool import WindowPool
+
+__all__ = [
+    "METHODS",
+    "DistributedEstimator",
+    "DistributedNode",
+    "DistributedOptions",
+    "Infeasibility",
+    "NetworkDesign",
+    "NetworkEstimate",
+    "NodePlan",
+    "WindowPool",
+    "options_of",
+]

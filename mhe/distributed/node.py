@@ -1,0 +1,398 @@
+"""`DistributedNode`: one node of DMHE, DMHE_pre or DMHE_w-pre behind its inbox.
+
+Source: dmhe-pre-estimation 4.2 (Algorithm 1) with errata E1-E3; missing neighbours by the rule of design 3.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from mhe.arrival import inverse
+from mhe.covariance import (
+    SETTLED_TOLERANCE,
+    arrival_update,
+    capped,
+    output_information,
+    symmetrized,
+    window_information,
+)
+from mhe.distributed.plan import NodePlan
+from mhe.distributed.pool import WindowPool
+from mhe.estimate import Estimate
+from problems.errors import DataError, ShapeError
+from problems.runtime import Message, NeighborMemory, Outgoing, Schema
+from problems.runtime.message import Field
+from problems.solvers.base import Status
+from problems.solvers.session import Session, Solution
+
+SOLVED = (Status.SOLVED, Status.INACCURATE)
+STOPPED = (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
+VIOLATED = 1e-6  # slack beyond which a soft bound counts as not met
+
+
+class DistributedNode:
+    """Estimates the state from the measurements of its in-neighbourhood and the estimates of its in-neighbours.
+
+    One message per step goes to all out-neighbours: the measurement y_t, the state of instant s_t = max(0, t - N) as
+    estimated in the step before, and its covariance unless that was worked out off-line. `finish` returns an
+    `Estimate`. A node that (re)starts later than instant 0 has nothing but its plan: it treats earlier measurements as
+    missing, earlier inputs as zero, and takes its prior from the neighbours it hears.
+
+    Args:
+        plan: what the node is told before the run.
+        pool: where its window is compiled.
+
+    Attributes:
+        rounds: no exchange beyond the one message.
+    """
+
+    rounds = 0
+
+    def __init__(self, plan: NodePlan, pool: WindowPool | None = None) -> None:
+        self._plan, self._pool = plan, WindowPool() if pool is None else pool
+        model, options = plan.model, plan.options
+        self._model, self._horizon = model, options.horizon
+        self._window, base = self._pool.get(model, plan.gain, options, plan.state_bounds, plan.disturbance_bounds)
+        self._session: Session = base.fork()
+        self._soft: Session | None = None
+        n = model.state_size
+        own = plan.member_rows[plan.own]
+        self._own_size = own.stop - own.start
+        self._place = {member: k for k, member in enumerate(plan.members)}
+        self._schemas = {
+            member: schemas(rows.stop - rows.start, n, options.covariances == "online")
+            for member, rows in zip(plan.members, plan.member_rows, strict=True)
+        }
+        self._speaks = self._schemas[plan.index]
+        forget = options.horizon if options.forget_after is None else options.forget_after
+        self._memory = NeighborMemory(
+            plan.members,
+            plan.weights,
+            self._propagate,
+            model.process_covariance,
+            period=plan.period,
+            forget_after=forget,
+        )
+        self._mean, start = model.prior()
+        self._fused = start
+        self._settled = False
+        if plan.schedule is None:
+            self._information = output_information(model.C, model.R)
+            windows = [self._information] * options.horizon
+            self._windowed = window_information(windows, model.A, model.process_covariance)
+        self._passed: np.ndarray | None = None
+        slots = options.horizon + 1
+        self._y = np.full((slots, model.measurement_size), np.nan)
+        self._flat = self._y.reshape(-1, 1)
+        self._u = np.zeros((slots, model.input_size))
+        self._older = np.zeros((forget, model.input_size))  # inputs before the window, to propagate old estimates
+        self._states = np.tile(self._mean, (slots, 1))
+        self._now: int | None = None
+        self._published: np.ndarray | None = None
+        self._data: dict[str, Any] = {"y": self._flat} if model.measurement_size else {}
+
+    # What a step consists of
+
+    def measure(self, time: float, measurement: Any) -> tuple[Outgoing, ...]:
+        """Take y_t, or (y_t, u_{t-1}) where the model has inputs, and speak.
+
+        Args:
+            time: t times the period.
+            measurement: y_t (p_i,), NaN where a component is missing, None where all are.
+
+        Raises:
+            ShapeError: wrong shapes.
+            DataError: infinite numbers, or no input where the model has inputs.
+        """
+        instant = round(time / self._plan.period)
+        y, u = self._reading(measurement, instant)
+        self._advance(instant, u)
+        self._y[self._newest, self._plan.member_rows[self._plan.own]] = y
+        self._time = float(time)
+        reading, full = self._speaks
+        if self._published is None:
+            return (reading.message(y=y),)
+        if self._plan.schedule is not None:
+            self._memory.receive(self._plan.index, self._time, self._published)
+            return (full.message(y=y, state=self._published),)
+        covariance = self._local()
+        self._memory.receive(self._plan.index, self._time, self._published, covariance)
+        return (full.message(y=y, state=self._published, covariance=covariance),)
+
+    def exchange(self, index: int, inbox: list[Message]) -> Iterable[Outgoing]:
+        """Never called: the node speaks once per step."""
+        return ()
+
+    def finish(self, inbox: list[Message]) -> Estimate:
+        """Hear the neighbours, solve the local problem and publish.
+
+        Raises:
+            DataError: a message from a stranger or of another definition.
+        """
+        started = perf_counter()
+        current, late = self._hear(inbox)
+        newest, instant = self._newest, self._now
+        missing = ()
+        if np.isnan(self._y[newest]).any():
+            missing = tuple(np.flatnonzero(np.isnan(self._y[newest])).tolist())
+        status, infeasible = Status.SOLVED, ()
+        if instant == 0:
+            self._published = self._mean
+        else:
+            self._arrival(current)
+            status, infeasible = self._solve()
+            # s_{t+1} = s_t while the window grows, then the next instant
+            self._published = self._states[1 if newest == self._horizon else 0].copy()
+        return Estimate(
+            state=self._states[newest].copy(),
+            covariance=None,
+            window=self._states[: newest + 1].copy(),
+            status=status,
+            seconds=perf_counter() - started,
+            infeasible=infeasible,
+            missing=missing,
+            late=late,
+            time=self._time,
+            state_names=self._model.state_names,
+        )
+
+    # Measurements and messages
+
+    def _reading(self, measurement: Any, instant: int) -> tuple[np.ndarray, np.ndarray]:
+        size, m = self._own_size, self._model.input_size
+        given, inputs = measurement if m and measurement is not None else (measurement, None)
+        y = np.full(size, np.nan) if given is None else np.asarray(given, dtype=float)
+        if y.shape != (size,):
+            if y.size != size:
+                raise ShapeError(f"node {self._plan.label}: expected {size} measurement(s), got shape {y.shape}")
+            y = y.reshape(size)
+        if np.isinf(y).any():
+            raise DataError(f"node {self._plan.label}: an infinite measurement at time step {instant}")
+        if inputs is None:
+            if m and instant:
+                raise DataError(f"node {self._plan.label}: the model needs {m} input(s) at time step {instant}")
+            return y, np.zeros(m)
+        u = np.asarray(inputs, dtype=float)
+        if u.shape != (m,) or not np.isfinite(u).all():
+            raise DataError(f"node {self._plan.label}: expected {m} finite input(s), got {inputs!r}")
+        return y, u
+
+    def _advance(self, instant: int, u: np.ndarray) -> None:
+        """Move the window on to `instant`."""
+        N = self._horizon
+        first = self._now is None
+        before = instant if self._now is None else self._now
+        for step in range(before + 1, instant + 1):
+            if step > N:
+                self._y[:-1] = self._y[1:]
+                if u.size:
+                    self._older[:-1] = self._older[1:]
+                    self._older[-1:] = self._u[:1]
+                    self._u[:-1] = self._u[1:]
+            self._y[min(step, N)] = np.nan
+            self._u[min(step, N)] = 0.0
+        self._slid = instant > N
+        self._now, self._newest = instant, min(instant, N)
+        self._u[self._newest] = u
+        if u.size:
+            self._data["u"] = self._u
+        if self._window.bounds and (first or not self._slid or before < N):
+            self._data["filled"] = (np.arange(N + 1) <= self._newest).astype(float)
+
+    def _hear(self, inbox: Sequence[Message]) -> tuple[list[np.ndarray] | None, tuple[float, ...]]:
+        """Take over what was received.
+
+        Returns:
+            The states of all members in their order if all spoke in this step, else None; times of late measurements.
+        """
+        heard: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
+        late: list[float] = []
+        for message in inbox:
+            place = self._place.get(message.sender)
+            if place is None:
+                raise DataError(f"node {self._plan.label} heard node {message.sender}, which is no in-neighbour")
+            reading, full = self._schemas[message.sender]
+            complete = message.schema == full.id
+            values = (full if complete else reading).unpack(message)
+            slot = round(message.time / self._plan.period) - (self._now or 0) + self._newest
+            if 0 <= slot <= self._newest:
+                self._y[slot, self._plan.member_rows[place]] = values["y"]
+                if slot < self._newest:
+                    late.append(message.time)
+            if not complete:
+                continue
+            covariance = values.get("covariance")
+            self._memory.receive(message.sender, message.time, values["state"], covariance)
+            if message.time == self._time:
+                heard[message.sender] = values["state"], covariance
+        self._covariances: list[Any] | None = None
+        if self._published is None or len(heard) < len(self._place) - 1:
+            return None, tuple(late)
+        heard[self._plan.index] = self._published, self._own_covariance
+        self._covariances = [heard[member][1] for member in self._plan.members]
+        return [heard[member][0] for member in self._plan.members], tuple(late)
+
+    def _propagate(self, state: np.ndarray, age: int) -> np.ndarray:
+        """A neighbour's published state of `age` steps ago, brought to the first instant of the present window."""
+        now, N = self._now or 0, self._horizon
+        steps = max(0, now - N) - max(0, now - age - N)
+        for k in range(steps, 0, -1):
+            state = self._model.A @ state
+            if self._model.input_size:
+                # the input of the transition that ends k - 1 instants before the window's first one
+                u = self._u[0] if k == 1 else self._older[1 - k]
+                state = state + self._model.B @ u
+        return state
+
+    # Arrival cost
+
+    _own_covariance: np.ndarray | None = None
+
+    def _local(self) -> np.ndarray:
+        """Pi^i of the state that is published now (3.3 steps 4 and 5); Pi_0 while the window grows."""
+        if (self._now or 0) > self._horizon:
+            model, rule = self._model, self._plan.options.pi_update
+            self._own_covariance = arrival_update(
+                self._fused, model.A, model.process_covariance, self._information, self._windowed, rule
+            )
+        else:
+            self._own_covariance = self._model.prior()[1]
+        return self._own_covariance
+
+    def _arrival(self, current: list[np.ndarray] | None) -> None:
+        """Reference and information of the arrival cost."""
+        plan, instant = self._plan, self._now or 0
+        growing = instant <= self._horizon
+        if current is not None:
+            reference = plan.weights @ np.array(current)
+            fused = self._nominal(instant, growing)
+        else:
+            reference, fused = self._incomplete(instant, growing)
+        if growing and plan.options.growth_prior != "consensus":
+            own = plan.options.growth_prior == "own" and self._published is not None
+            reference = self._published if own else self._mean
+        self._data["reference"] = reference
+        if fused is self._fused and self._passed is not None:
+            return
+        self._fused = fused
+        information = inverse(fused)
+        passed = self._passed
+        if passed is None or np.abs(information - passed).max() > SETTLED_TOLERANCE * np.abs(information).max():
+            self._data["information"] = self._passed = information
+
+    def _nominal(self, instant: int, growing: bool) -> np.ndarray:
+        """Pi_bar with all neighbours heard."""
+        schedule = self._plan.schedule
+        if schedule is not None:
+            entry = schedule.entry(instant)
+            if entry != self._entry:
+                self._entry, self._scheduled = entry, schedule.fused_at(instant)
+            return self._scheduled
+        if growing:
+            return self._model.prior()[1]
+        return self._combined(self._plan.coefficients, np.array(self._covariances))
+
+    _entry = -1
+    _scheduled: np.ndarray
+
+    def _combined(self, coefficients: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+        fused = symmetrized(np.tensordot(coefficients, covariances, 1))
+        return fused if self._plan.cap is None else capped(fused, self._plan.cap)
+
+    def _incomplete(self, instant: int, growing: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Reference and Pi_bar where neighbours are missing."""
+        plan = self._plan
+        try:
+            recall = self._memory.recall(self._time)
+        except DataError:
+            return self._alone(instant)
+        reference = recall.weights @ recall.states
+        if growing:
+            return reference, self._model.prior()[1]
+        covariances = recall.covariances
+        places = [self._place[member] for member in recall.members]
+        if plan.schedule is not None:
+            aged = recall.ages[:, None, None] * self._model.process_covariance
+            covariances = plan.schedule.local_at(instant)[places] + aged
+        assert covariances is not None
+        share = plan.weights[places].sum()
+        coefficients = plan.coefficients[places] / share**plan.power if share > 0 else recall.weights
+        return reference, self._combined(coefficients, covariances)
+
+    def _alone(self, instant: int) -> tuple[np.ndarray, np.ndarray]:
+        """The prior of instant 0 propagated to the first instant of the window, where nothing was ever heard."""
+        model = self._model
+        reference, covariance = model.prior()
+        for _ in range(instant - self._horizon):
+            reference = model.A @ reference
+            covariance = model.A @ covariance @ model.A.T + model.process_covariance
+            if self._plan.cap is not None:
+                covariance = capped(covariance, self._plan.cap)
+        return reference, symmetrized(covariance)
+
+    # Local problem
+
+    def _solve(self) -> tuple[Status, tuple[str, ...]]:
+        before = self._states
+        data, self._data = self._data, {"y": self._flat} if self._model.measurement_size else {}
+        solution = self._session.solve(data)
+        status = solution.status
+        if status in SOLVED or (status in STOPPED and solution.iterations):
+            self._states = solution["x"]
+            return status, ()
+        self._states = self._predicted(before)
+        if status is not Status.INFEASIBLE:
+            return Status.FAILED if status in STOPPED else status, ()
+        return status, self._relaxed()
+
+    def _predicted(self, before: np.ndarray) -> np.ndarray:
+        """The window before, moved on by the model without disturbance."""
+        newest = self._newest
+        states = np.vstack([before[1:], before[-1:]]) if self._slid else before.copy()
+        for k in range(newest, self._horizon + 1):
+            states[k] = self._model.A @ states[k - 1] + self._model.B @ self._u[k]
+        return states
+
+    def _relaxed(self) -> tuple[str, ...]:
+        """Solve with slacks where that was asked for; names of the bounds that are not met."""
+        plan, names = self._plan, tuple(f"{name} bounds" for name in self._window.bounds)
+        if plan.options.infeasible == "predict":
+            return names
+        if self._soft is None:
+            bounds = plan.state_bounds, plan.disturbance_bounds
+            self._soft = self._pool.get(self._model, plan.gain, plan.options, *bounds, soft=True)[1].fork()
+        store = self._session.store
+        inputs = self._session.problem.inputs.items()
+        solution: Solution = self._soft.solve({name: store[name] for name, entry in inputs if entry.of is None})
+        if solution.status not in SOLVED:
+            return names
+        self._states = solution["x"]
+        filled = self._newest + 1
+        return tuple(
+            f"{name} bounds"
+            for name in self._window.bounds
+            if solution[f"{name} slack"][: filled - (name == "disturbance")].max(initial=0.0) > VIOLATED
+        )
+
+
+def schemas(measurements: int, states: int, online: bool) -> tuple[Schema, Schema]:
+    """What a node says before it has an estimate, and afterwards."""
+    reading: dict[str, Any] = {"y": (measurements,)}
+    full = reading | {"state": (states,)}
+    if online:
+        full["covariance"] = Field((states, states), symmetric=True)
+    return Schema("reading", reading), Schema("reading and estimate", full)
+
+
+class NodeFactory:
+    """Makes the nodes of a network from their plans, in any process."""
+
+    def __init__(self, plans: Sequence[NodePlan], pool: WindowPool) -> None:
+        self._plans, self._pool = tuple(plans), pool
+
+    def __call__(self, node: int) -> DistributedNode:
+        return DistributedNode(self._plans[node], self._pool)
