@@ -8,7 +8,7 @@ measurements are one term and no Python object each. Nothing is computed here; `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -143,8 +143,8 @@ class Term:
 class Problem:
     """An estimation problem: minimize costs over variables subject to equalities and inequalities.
 
-    Costs are ``1/2 r'Wr + linear'r`` (with a loss: ``rho(r'Wr)``). Variables, data and terms have names, unique in the
-    problem. Design: section 3.1.
+    Costs are ``1/2 r'Wr + linear'r`` (with a loss: ``rho(r'Wr)``). Names are unique among variables and data, and among
+    terms. Design: section 3.1.
     """
 
     def __init__(self, name: str = "problem") -> None:
@@ -164,7 +164,7 @@ class Problem:
         Raises:
             DefinitionError: the name is taken, `space` is no space, or `count` is not a positive whole number.
         """
-        self._free(name)
+        self._free(name, self.unknowns, self.inputs)
         if not isinstance(space, Space) or isinstance(space, type):
             raise DefinitionError(f"variables {name!r}: expected a space such as Vector(3), SO2 or SE2, got {space!r}")
         self.unknowns[name] = Variable(self, name, space, _count(count, f"variables {name!r}"))
@@ -188,7 +188,7 @@ class Problem:
         Raises:
             DefinitionError, ShapeError: the name is taken; the default does not fit.
         """
-        self._free(name)
+        self._free(name, self.unknowns, self.inputs)
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(k) for k in shape)
         if len(shape) > 2 or any(k < 1 for k in shape):
             raise ShapeError(f"data {name!r}: rows are numbers, vectors or matrices of positive size, got {shape}")
@@ -298,7 +298,7 @@ class Problem:
         return compile_problem(self, solver, form, eliminate, settings)
 
     def _term(self, kind: str, name: str, residual: Any, on: Any, data: Any, **parts: Any) -> Term:
-        self._free(name)
+        self._free(name, self.terms)
         what = f"{kind} {name!r}"
         if not callable(residual):
             raise DefinitionError(f"{what}: the residual must be a function of symbols, got {residual!r}")
@@ -347,10 +347,10 @@ class Problem:
         if entry.problem is not self:
             raise DefinitionError(f"{what}: {entry!r} belongs to problem {entry.problem.name!r}, not to {self.name!r}")
 
-    def _free(self, name: str) -> None:
+    def _free(self, name: str, *taken: Mapping[str, Any]) -> None:
         if not isinstance(name, str) or not name:
             raise DefinitionError(f"a name must be a non-empty string, got {name!r}")
-        if name in self.unknowns or name in self.inputs or name in self.terms:
+        if any(name in names for names in taken):
             raise DefinitionError(f"the name {name!r} is already used in problem {self.name!r}")
 
 
