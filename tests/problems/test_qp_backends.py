@@ -409,7 +409,7 @@ def test_a_warm_start_saves_iterations_and_a_cold_one_forgets(name: str) -> None
     assert backend.solve(qp.q, qp.l, qp.u).iterations == cold.iterations
     # Another node's problem in between: the point given counts, not what the library still has.
     backend.solve(-qp.q, qp.l, qp.u)
-    assert backend.solve(qp.q, qp.l, qp.u, (cold.x, cold.y)).iterations < cold.iterations
+    assert 2 * backend.solve(qp.q, qp.l, qp.u, (cold.x, cold.y)).iterations < cold.iterations
     last = backend.solve(qp.q, qp.l, qp.u)
     assert backend.solve(qp.q, qp.l, qp.u, (last.x, last.y)).iterations < cold.iterations
 
@@ -603,6 +603,38 @@ def test_a_row_of_zeros(cls: type[Any]) -> None:
         status, result = padded.judged(backend)
         assert status is Status.SOLVED, result.message
         np.testing.assert_allclose(result.x, expected, atol=1e-5)
+
+
+class RefusingModel:
+    """A DAQP model whose update is refused, and that answers all the same, as older versions of the library do."""
+
+    def __init__(self, model: Any, flags: list[int]) -> None:
+        self.model, self.flags = model, flags
+
+    def update(self, *args: Any) -> int:
+        flag = self.model.update(*args)
+        return self.flags.pop(0) if self.flags else flag
+
+    def solve(self) -> tuple[Any, ...]:
+        x, value, flag, info = self.model.solve()
+        return (x, value, flag, info) if not self.flags else (x + 1.0, value, 1, info)
+
+
+def test_daqp_does_not_solve_after_a_refused_update() -> None:
+    cls = backend_class("daqp")
+    qp = boxed()
+    for flag, wanted in ((-1, Status.INFEASIBLE), (-5, Status.FAILED)):
+        backend = qp.backend(cls)
+        backend._model = RefusingModel(backend._model, [flag, flag])
+        assert backend.solve(qp.q, qp.l, qp.u).status is wanted
+        # Built anew, without the refusing model.
+        assert qp.judged(backend)[0] is Status.SOLVED
+    # A working set that is refused is no reason to give up.
+    backend = qp.backend(cls)
+    last = backend.solve(qp.q, qp.l, qp.u)
+    backend._model = RefusingModel(backend._model, [-6])
+    status, _ = qp.judged(backend, warm=(last.x.copy(), last.y.copy()))
+    assert status is Status.SOLVED
 
 
 def test_matrices_that_are_not_finite(cls: type[Any]) -> None:
