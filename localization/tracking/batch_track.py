@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from localization.io.recording import TimeSeries, UwbRecording
-from localization.tracking.multilateration import multilaterate
+from localization.tracking.multilateration import multilaterate, prepare
 from localization.tracking.range_tracker import RangeTracker, RangeTrackerSettings, Track, arrivals, heights, track
 from problems.solvers.base import Status
 
@@ -52,28 +52,41 @@ def batch_track(
         tracker.status,
         solution.iterations,
         solution.objective,
+        max(solution.residuals.values()),
     )
 
 
 def snapshot_track(
-    recording: UwbRecording, start: np.ndarray, settings: RangeTrackerSettings | None = None, memory: float = 0.5
+    recording: UwbRecording,
+    start: np.ndarray,
+    settings: RangeTrackerSettings | None = None,
+    solver: str = "gauss-newton",
+    memory: float = 0.5,
 ) -> Track:
-    """Multilateration of the ranges of the last `memory` seconds at every knot; no motion model, no bias states."""
+    """Multilateration of the ranges of the last `memory` seconds at every knot; no motion model, no bias states.
+
+    A knot that hears fewer than three anchors in that time keeps the last position and counts as failed.
+    """
     s = settings or RangeTrackerSettings()
     knots, _ = arrivals(recording, s, None)
     anchors = heights(recording.anchors, s)
-    position = np.asarray(start, dtype=float)
-    out, seconds, status, cost = np.empty((len(knots), 2)), np.empty(len(knots)), Counter[str](), 0.0
     last = np.searchsorted(recording.time, knots, side="right")
     first = np.searchsorted(recording.time, knots - memory, side="right")
+    heard = [np.unique(recording.anchor[a:b]).size >= 3 for a, b in zip(first, last, strict=True)]
+    compile_seconds = prepare((last - first)[heard], solver=solver)
+    position, cost, iterations = np.asarray(start, dtype=float), 0.0, 0
+    out, seconds, status = np.empty((len(knots), 2)), np.empty(len(knots)), Counter[str]()
     for j, (a, b) in enumerate(zip(first, last, strict=True)):
         begin = time.perf_counter()
-        if np.unique(recording.anchor[a:b]).size >= 3:
+        outcome = Status.FAILED
+        if heard[j]:
             ranges = recording.ranges[a:b] - s.bias_mean * s.bias
-            position, cost = multilaterate(anchors[recording.anchor[a:b]], ranges, s.height, near=position)
-            status[Status.SOLVED.value] += 1
-        else:
-            status[Status.FAILED.value] += 1
+            found = multilaterate(anchors[recording.anchor[a:b]], ranges, s.height, near=position, solver=solver)
+            position, cost, outcome = found.position, found.cost, found.status
+            iterations += found.iterations
+        status[str(outcome)] += 1
         out[j], seconds[j] = position, time.perf_counter() - begin
     bias = np.full(len(anchors), s.bias_mean * s.bias)
-    return Track(TimeSeries(knots, out), np.zeros_like(out), None, bias, seconds, 0.0, status, len(knots), cost)
+    return Track(
+        TimeSeries(knots, out), np.zeros_like(out), None, bias, seconds, compile_seconds, status, iterations, cost, None
+    )

@@ -8,6 +8,7 @@ cost is the marginal of the oldest knot (``prior=filter``), biases included.
 from __future__ import annotations
 
 import time
+import warnings
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any
@@ -16,10 +17,10 @@ import casadi as ca
 import numpy as np
 
 from localization.io.recording import TimeSeries, UwbRecording
-from localization.tracking.multilateration import multilaterate
-from problems.errors import DataError, SettingError
+from localization.tracking.multilateration import multilaterate, spread_of
+from problems.errors import DataError, ModelWarning, SettingError
 from problems.forms.marginal import Marginal
-from problems.noise import Cauchy, Gaussian, L2
+from problems.noise import L2, Cauchy, Gaussian
 from problems.problem import Problem
 from problems.solvers.session import Solution
 from problems.spaces import Vector
@@ -45,6 +46,9 @@ class RangeTrackerSettings:
         start_sigma, speed_sigma: of the first position (m) and velocity (m/s).
         iterations: Gauss-Newton steps per knot; 0 iterates to convergence.
         capacity: ranges of one anchor that a knot can hold.
+
+    Raises:
+        SettingError: a value that has no meaning.
     """
 
     horizon: int = 20
@@ -64,6 +68,23 @@ class RangeTrackerSettings:
     speed_sigma: float = 2.0
     iterations: int = 3
     capacity: int = 2
+
+    def __post_init__(self) -> None:
+        positive = ("period", "acceleration", "range_sigma", "bias_sigma", "gps_sigma", "start_sigma", "speed_sigma")
+        for name in ("horizon", "capacity"):
+            if getattr(self, name) < 1:
+                raise SettingError(f"{name} must be at least 1, got {getattr(self, name)!r}")
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise SettingError(f"{name} must be positive, got {getattr(self, name)!r}")
+        for name in ("loss", "bias_walk", "lag", "delay", "iterations"):
+            if not getattr(self, name) >= 0:
+                raise SettingError(f"{name} must not be negative, got {getattr(self, name)!r}")
+        if round(self.delay / self.period) > self.horizon:
+            raise SettingError(
+                f"delay {self.delay:g} s is longer than the window of {self.horizon * self.period:g} s; "
+                "give a longer horizon or a shorter delay"
+            )
 
 
 def range_at_offset(x: Any, bias: Any, anchor: Any, z: Any, offset: Any, height: Any) -> Any:
@@ -108,8 +129,6 @@ class RangeTracker:
         self.anchors = np.asarray(anchors, dtype=float)
         if self.anchors.ndim != 2 or self.anchors.shape[1] != 3:
             raise DataError(f"anchors are (k, 3) positions in metres, got shape {self.anchors.shape}")
-        if round(s.delay / s.period) > s.horizon:
-            raise SettingError(f"delay {s.delay:g} s is longer than the window of {s.horizon * s.period:g} s")
         k, slots = len(self.anchors), s.horizon + 1
         problem = self.problem = Problem("range tracking")
         self._state = state = problem.variables("state", Vector(4), slots)
@@ -182,13 +201,19 @@ class RangeTracker:
     def enter(
         self, row: int, ranges: tuple[np.ndarray, np.ndarray, np.ndarray], fixes: np.ndarray | None = None
     ) -> None:
-        """Put what was measured in the period before a knot into window slot `row`; arguments as for `step`."""
+        """Put what was measured in the period before a knot into window slot `row`; arguments as for `step`.
+
+        Of more ranges to an anchor than a knot can hold the newest are kept; `dropped` counts the others.
+        """
         for anchor, value, offset in zip(*ranges, strict=True):
-            place = np.flatnonzero(np.isnan(self._ranges[row, anchor]))
-            if place.size == 0:
-                self.dropped += 1  # keep the newest
-                place = np.array([int(np.argmin(self._offsets[row, anchor]))])
-            self._ranges[row, anchor, place[0]], self._offsets[row, anchor, place[0]] = value, offset
+            held, offsets = self._ranges[row, anchor], self._offsets[row, anchor]
+            free = np.flatnonzero(np.isnan(held))
+            place = int(free[0]) if free.size else int(np.argmin(offsets))
+            if not free.size:
+                self.dropped += 1
+                if offset <= offsets[place]:
+                    continue
+            held[place], offsets[place] = value, offset
         if fixes is not None:
             self._fixes[row], self._fix_offsets[row] = fixes[:2], fixes[2]
 
@@ -250,6 +275,7 @@ class Track:
         step_seconds: (m,) computing time of each knot.
         compile_seconds: of the session. status: solves by status. iterations: in total.
         objective: cost of the last window.
+        residual: worst of its recomputed residuals.
     """
 
     estimate: TimeSeries
@@ -261,20 +287,30 @@ class Track:
     status: Counter[str]
     iterations: int
     objective: float
+    residual: float | None
 
 
 def first_position(recording: UwbRecording, settings: RangeTrackerSettings, seconds: float = 1.0) -> np.ndarray:
     """Position (2,) at the start, from the ranges of the first seconds alone.
 
     Raises:
-        DataError: fewer than three ranges in that time.
+        DataError: the anchors heard in that time leave the position open.
     """
     early = recording.time <= recording.time[0] + seconds
-    return multilaterate(
-        heights(recording.anchors, settings)[recording.anchor[early]],
+    anchors = heights(recording.anchors, settings)
+    heard = np.unique(recording.anchor[early])
+    if spread_of(anchors[heard]) < 2:
+        names = ", ".join(recording.anchor_names[k] for k in heard)
+        raise DataError(
+            f"{recording.name}: in its first {seconds:g} s only {names} are heard; a start needs three anchors that "
+            "are not on one line. Give it: --set 'start=[x, y]' (m), or start=truth where there is truth"
+        )
+    found = multilaterate(
+        anchors[recording.anchor[early]],
         recording.ranges[early] - settings.bias_mean * settings.bias,
         settings.height,
-    )[0]
+    )
+    return found.position
 
 
 def heights(anchors: np.ndarray, settings: RangeTrackerSettings) -> np.ndarray:
@@ -328,6 +364,8 @@ def track(
         fixes: coarse position fixes in the anchors' frame.
         covariances: also compute the covariance of every knot.
         progress: called with the number of finished knots and of all.
+
+    Warns (`ModelWarning`) where knots cannot hold all ranges.
     """
     s = settings or RangeTrackerSettings()
     anchors = heights(recording.anchors, s)
@@ -347,6 +385,13 @@ def track(
             P[j] = tracker.covariance()
         if progress is not None:
             progress(j + 1, count)
+    if tracker.dropped:
+        warnings.warn(
+            f"{recording.name}: {tracker.dropped} of {len(recording.time)} ranges are left out, as a knot holds "
+            f"{s.capacity} of each anchor; set a larger capacity or a shorter period",
+            ModelWarning,
+            stacklevel=2,
+        )
     position = states[:, :2] + s.lag * states[:, 2:]
     keep = slice(round(s.delay / s.period), None)  # before, the reported knot stood still
     return Track(
@@ -359,4 +404,5 @@ def track(
         tracker.status,
         iterations,
         tracker.solution.objective,
+        max(tracker.solution.residuals.values()),
     )
