@@ -6,6 +6,7 @@ NumPy would dominate, one compiled function of the whole problem.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -18,6 +19,8 @@ from problems.forms.sparsity import HessianPattern
 from problems.forms.template import template_of
 from problems.noise import whitening
 from problems.problem import DataSlot, Problem
+
+Flags = Mapping[str, np.ndarray | None]  # active instances (count,) by term; None or left out: all
 
 WHOLE_LIMIT = 300  # instances up to which one function of the whole problem is faster (measured)
 
@@ -97,7 +100,7 @@ class LeastSquares:
 class Bound:
     """Costs for fixed data. `flags` tells which instances are on."""
 
-    def __init__(self, form: LeastSquares, store: DataStore, flags: dict[str, np.ndarray | None]) -> None:
+    def __init__(self, form: LeastSquares, store: DataStore, flags: Flags) -> None:
         self.form, self.store, self.flags = form, store, flags
         self.numbers = np.where(np.isnan(store.numbers), 0.0, store.numbers)
 
@@ -110,7 +113,7 @@ class Bound:
 
 
 class ArrayBound(Bound):
-    def __init__(self, form: LeastSquares, store: DataStore, flags: dict[str, np.ndarray | None]) -> None:
+    def __init__(self, form: LeastSquares, store: DataStore, flags: Flags) -> None:
         super().__init__(form, store, flags)
         self._parameters = [c.parameters(form.layout, store, self.numbers) for c in form.costs]
         self._out = [np.empty((c.kernel.code.outputs, c.entry.term.count)) for c in form.costs]
@@ -154,7 +157,7 @@ class ArrayBound(Bound):
 
 
 class WholeBound(Bound):
-    def __init__(self, form: LeastSquares, store: DataStore, flags: dict[str, np.ndarray | None]) -> None:
+    def __init__(self, form: LeastSquares, store: DataStore, flags: Flags) -> None:
         super().__init__(form, store, flags)
         assert form._function is not None
         parts = [self.numbers]
@@ -278,24 +281,35 @@ class Constraints:
             cols.append(np.broadcast_to(e.columns[:, None], shape).ravel())
         self.rows, self.columns = np.concatenate(rows), np.concatenate(cols)
 
-    def evaluate(self, point: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (size,) and Jacobian entries in the order of `rows`, `columns` (entries that repeat add up)."""
+    def evaluate(self, point: np.ndarray, numbers: np.ndarray, flags: Flags) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (size,) and Jacobian entries in the order of `rows`, `columns` (entries that repeat add up).
+
+        Those of instances that are off are zero, whatever their data would give.
+        """
         values, entries = [np.zeros(0)], [np.zeros(0)]
         for e, code in zip(self.terms, self._codes, strict=True):
             inputs = [*point[e.stored].T, *numbers[e.numbers].T]
             r, J = code.residual_and_jacobian([np.ascontiguousarray(v) for v in inputs], e.term.count)
+            on = flags.get(e.term.name)
+            if on is not None:
+                r[~on], J[~on] = 0.0, 0.0
             values.append(r.ravel())
             entries.append(J.ravel())
         return np.concatenate(values), np.concatenate(entries)
 
-    def residual(self, point: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    def residual(self, point: np.ndarray, numbers: np.ndarray, flags: Flags) -> np.ndarray:
+        """Rows alone."""
         values = [np.zeros(0)]
         for e, code in zip(self.terms, self._codes, strict=True):
             inputs = [*point[e.stored].T, *numbers[e.numbers].T]
-            values.append(code.residual([np.ascontiguousarray(v) for v in inputs], e.term.count).ravel())
+            r = code.residual([np.ascontiguousarray(v) for v in inputs], e.term.count)
+            on = flags.get(e.term.name)
+            if on is not None:
+                r[~on] = 0.0
+            values.append(r.ravel())
         return np.concatenate(values)
 
-    def bounds(self, numbers: np.ndarray, flags: dict[str, np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
+    def bounds(self, numbers: np.ndarray, flags: Flags) -> tuple[np.ndarray, np.ndarray]:
         """(size,) bounds; zero for equalities, infinite for instances that are off."""
         lower, upper = np.zeros(self.size), np.zeros(self.size)
         for k, (e, d) in enumerate(zip(self.terms, self.dims, strict=True)):

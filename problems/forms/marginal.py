@@ -149,7 +149,7 @@ class NonlinearMarginal:
         H = np.zeros(size * size)
         H[self._upper] = H[self._lower] = entries
         order = plan.columns
-        values, jacobian = self._constraints.evaluate(at, bound.numbers)
+        values, jacobian = self._constraints.evaluate(at, bound.numbers, bound.flags)
         shape = (self._constraints.size, size)
         F = sp.coo_array((jacobian, (self._constraints.rows, self._constraints.columns)), shape=shape).toarray()
         M, linear = schur(

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from problems.errors import SettingError, UnobservableError
 from problems.forms.layout import Layout
 from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
@@ -23,8 +24,9 @@ from problems.solvers.least_squares_solution import LeastSquaresCheck
 from problems.solvers.linear import SingularError, factorization
 from problems.solvers.optimality import optimality
 from problems.solvers.qp_step import QPStep
+from problems.solvers.qp_support import checked_settings
 from problems.solvers.session import Session, Solution
-from problems.solvers.settings import read_settings
+from problems.solvers.settings import own_version
 
 DAMPING_START = 1e-6
 DAMPING_LIMIT = 1e12
@@ -57,7 +59,9 @@ class GaussNewton(Session):
     extra = None
 
     def __init__(self, problem: Problem, options: Options) -> None:
-        self.settings = read_settings(Settings, options.extra, "gauss-newton")
+        self.settings = checked_settings(Settings, options.extra, "gauss-newton")
+        if self.settings.iterations is not None and self.settings.iterations < 1:
+            raise SettingError(f"solver gauss-newton: iterations must be positive, got {self.settings.iterations}")
         layout = Layout(problem)
         super().__init__(problem, layout, "gauss-newton", options)
         self.form_ = LeastSquares(problem, layout, self.settings.whole)
@@ -66,8 +70,7 @@ class GaussNewton(Session):
         pattern = self.form_.pattern
         self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._linear = factorization(pattern)
-        self._step = QPStep(pattern, self.constraints, self.pins, options, self.settings.qp_solver)
-        self._prepared: tuple[np.ndarray, np.ndarray] | None = None
+        self._renew()
 
     @classmethod
     def compile(cls, problem: Problem, form: str, options: Options) -> GaussNewton:
@@ -75,17 +78,27 @@ class GaussNewton(Session):
 
     @classmethod
     def version(cls) -> str:
-        from problems.solvers.settings import own_version
-
         return own_version()
 
     def _forked(self) -> None:
         self._linear = factorization(self.form_.pattern)
+        self._renew()
+
+    def reset(self) -> None:
+        super().reset()
+        self._renew()
+
+    def _renew(self) -> None:
         self._step = QPStep(self.form_.pattern, self.constraints, self.pins, self.options, self.settings.qp_solver)
-        self._prepared = None
+        self._prepared: tuple[np.ndarray, np.ndarray] | None = None
 
     def prepare(self, initial: Mapping[str, Any] | None = None) -> None:
-        """Linearize and factorize at `initial` with the data given so far; the next solve is one feedback step."""
+        """Linearize and factorize at `initial` with the data given so far; the next solve is one feedback step.
+
+        Raises:
+            DataError, NoiseError: data never given or that cannot be used.
+            UnobservableError: the matrix is singular with these data.
+        """
         if initial is not None:
             self._point = self.layout.point(initial, self._point)
         self.store.require_all()
@@ -94,7 +107,10 @@ class GaussNewton(Session):
         point = self.pins.apply(start, bound.numbers)
         _, gradient, hessian = bound.linearize(point)
         self.pins.reduce(gradient, hessian, self.form_.pattern)
-        self._linear.factor(hessian)
+        try:
+            self._linear.factor(hessian)
+        except SingularError as error:
+            raise UnobservableError(f"prepare: the costs leave a direction free at this point ({error})") from error
         self._prepared = (point, hessian)
 
     def _solve(self) -> Solution:
@@ -103,7 +119,12 @@ class GaussNewton(Session):
         prepared, self._prepared = self._prepared, None
         if prepared is None:
             search = _Search(self, bound, self.pins.apply(start, bound.numbers))
-            status, message = search.run()
+            violation = self.pins.violation(search.point, bound.numbers)
+            if violation <= 10 * self.options.tolerance:
+                status, message = search.run()
+            else:
+                names = ", ".join(sorted(self.pins.names))
+                status, message = Status.INFEASIBLE, f"no point found that satisfies {names}: {violation:.3g} remains"
         else:
             search = _Search(self, bound, prepared[0])
             status, message = search.feedback(prepared[1])
@@ -143,7 +164,7 @@ class _Search:
                 return Status.FAILED, "the cost is not finite at the iterate"
             self.iterations += 1
             outcome = self._advance(cost, gradient, hessian, tolerance, fixed is not None)
-            if outcome is not None and fixed is None:
+            if outcome is not None:
                 return outcome
         if fixed is not None:
             return Status.SOLVED, f"{fixed} iteration(s) as asked, convergence not tested"
@@ -229,7 +250,7 @@ class _Search:
     ) -> tuple[tuple[Status, str] | None, np.ndarray]:
         """The step that satisfies the linearized constraints; the free one where it does already and is asked for."""
         constraints = self.session.constraints
-        values, entries = constraints.evaluate(self.point, self.numbers)
+        values, entries = constraints.evaluate(self.point, self.numbers, self.bound.flags)
         rows = values + np.bincount(constraints.rows, entries * step[constraints.columns], constraints.size)
         inside = (rows <= self.upper + self.options.tolerance) & (rows >= self.lower - self.options.tolerance)
         if self.session.settings.screen and inside.all():
@@ -252,7 +273,7 @@ class _Search:
         constraints = self.session.constraints
         if not constraints.size:
             return np.zeros(0)
-        values = constraints.residual(point, self.numbers)
+        values = constraints.residual(point, self.numbers, self.bound.flags)
         return np.maximum(np.maximum(values - self.upper, self.lower - values), 0.0)
 
     def _free(self, hessian: np.ndarray) -> str:

@@ -47,7 +47,7 @@ class LeastSquaresCheck:
     def _rows(self) -> tuple[np.ndarray, Any, np.ndarray, np.ndarray]:
         """Values, Jacobian, bounds of the constraints."""
         c = self._constraints
-        values, entries = c.evaluate(self._point, self._numbers)
+        values, entries = c.evaluate(self._point, self._numbers, self._bound.flags)
         J = sp.csr_array(sp.coo_array((entries, (c.rows, c.columns)), shape=(c.size, self._form.pattern.size)))
         lower, upper = c.bounds(self._numbers, self._bound.flags)
         return values, J, lower, upper
@@ -71,13 +71,14 @@ class LeastSquaresCheck:
         return g
 
     def residuals(self) -> dict[str, float]:
-        dual, primal, gap = self._free_gradient, 0.0, 0.0
+        dual, gap = self._free_gradient, 0.0
+        primal = self._pins.violation(self._point, self._numbers)
         if self._constraints.size:
             values, J, lower, upper = self._rows
             y = self._multipliers
             dual = dual + J.T @ y
             dual[self._pins.columns] = 0.0
-            primal = float(np.maximum(np.maximum(values - upper, lower - values), 0.0).max())
+            primal = max(primal, float(np.maximum(np.maximum(values - upper, lower - values), 0.0).max()))
             bound = np.where(y > 0, upper, np.where(y < 0, lower, values))
             gap = float(np.abs(y * np.where(np.isfinite(bound), bound - values, np.sign(y))).sum())
         out = {"primal": primal, "dual": float(np.abs(dual).max(initial=0.0))}
@@ -85,7 +86,10 @@ class LeastSquaresCheck:
         return out
 
     def multipliers(self) -> dict[str, np.ndarray]:
-        return self._by_term(self._multipliers if self._constraints.size else np.zeros(0))
+        dual, out = self._linearized[0], {}
+        if self._constraints.size:
+            dual, out = dual + self._rows[1].T @ self._multipliers, self._by_term(self._multipliers)
+        return out | self._pins.multipliers(self._point, self._numbers, dual)
 
     def active_set(self) -> dict[str, np.ndarray]:
         if not self._constraints.size:
