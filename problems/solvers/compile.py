@@ -1,7 +1,7 @@
 """From a problem and a solver's name to a session.
 
 What is registered in ``horizonet.solvers`` is either a QP backend (`QPBackend`) or a class with ``forms``, the forms it
-takes, and ``compile(problem, form, eliminate, options) -> Session``.
+takes, and ``compile(problem, form, options) -> Session``.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from problems.forms.quadratic import QuadraticProgram
 from problems.problem import Problem
 from problems.solvers.base import Options
 from problems.solvers.qp_session import QPSession
+from problems.solvers.qp_support import Backend, checked_settings
 from problems.solvers.session import Session
 
 ALIASES = {"gtsam": "gtsam-lm"}
@@ -80,7 +81,10 @@ def _quadratic(
     warm = bool(settings.pop("warm", True))
     if backend is None:
         backend = registry.load("solvers", "daqp" if program.dense else "proxqp")
-    return QPSession(program, solver, backend, options_of(settings), screen, warm)
+    options = options_of(settings)
+    if issubclass(backend, Backend):  # a screened session may need its backend late or never
+        checked_settings(backend.settings_type, options.extra, backend.name)
+    return QPSession(program, solver, backend, options, screen, warm)
 
 
 def is_affine(problem: Problem) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from problems.errors import DataError, MissingExtraError, SettingError
+from problems.errors import MissingExtraError, SettingError
 from problems.forms.affine_marginal import AffineMarginal, AffineMarginalPlan
 from problems.forms.marginal import Marginal
 from problems.forms.quadratic import QuadraticProgram, clean
@@ -60,7 +60,6 @@ class QPSession(Session):
         self._switches = program.activity.switches.size > 0
         self._watched = self.slow | self.switching
         self._complete_key: bytes | None = None if self._switches else b""
-        self._bound_numbers = _bound_positions(program)
         self._maps: dict[bytes, DenseMap | SparseMap] = {}
         self._marginals: dict[Any, AffineMarginal] = {}
         self._last_marginal: tuple[bytes, Any, Any, AffineMarginal] | None = None
@@ -107,15 +106,8 @@ class QPSession(Session):
             if self._complete_key is None:
                 self._complete_key = self.program.activity.key(d)
             return self._complete_key, d
-        infinite = np.isinf(d)
-        infinite[self._bound_numbers] = False
-        if infinite.any():
-            raise DataError(f"data {self._name_of(int(np.flatnonzero(infinite)[0]))!r} have an infinite value")
+        self.store.require_finite()
         return self.program.activity.key(d), clean(d)
-
-    def _name_of(self, position: int) -> str:
-        starts = self.layout.data_start
-        return max((start, name) for name, start in starts.items() if start <= position)[1]
 
     def _map(self, pattern: bytes, numbers: np.ndarray) -> DenseMap | SparseMap:
         map_ = self._maps.get(pattern)
@@ -249,14 +241,3 @@ def _switching(program: QuadraticProgram) -> frozenset[str]:
     switches = {t.active.source.name for t in terms if isinstance(t.active, DataSlot)}
     weights = {t.noise.value.source.name for t in terms if t.noise and isinstance(t.noise.value, DataSlot)}
     return frozenset(name for name in switches - weights if program.speeds[name] == "weight")
-
-
-def _bound_positions(program: QuadraticProgram) -> np.ndarray:
-    """Positions of data that are bounds and may be infinite."""
-    found = [
-        program.layout.numbers(value).ravel()
-        for term in program.problem.terms.values()
-        for value in (term.lower, term.upper)
-        if isinstance(value, DataSlot)
-    ]
-    return np.concatenate(found) if found else np.zeros(0, np.intp)
