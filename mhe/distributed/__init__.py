@@ -1,5 +1,6 @@
 """Distributed moving horizon estimation over a network, with and without pre-estimation."""
 
+from mhe.distributed.batched import BatchedNetwork, BatchEstimate, TrialInfeasibility, TrialRun, run_trials
 from mhe.distributed.design import NetworkDesign
 from mhe.distributed.network import DistributedEstimator, Infeasibility, NetworkEstimate
 from mhe.distributed.node import DistributedNode
@@ -9,6 +10,8 @@ from mhe.distributed.pool import WindowPool
 
 __all__ = [
     "METHODS",
+    "BatchEstimate",
+    "BatchedNetwork",
     "DistributedEstimator",
     "DistributedNode",
     "DistributedOptions",
@@ -16,6 +19,9 @@ __all__ = [
     "NetworkDesign",
     "NetworkEstimate",
     "NodePlan",
+    "TrialInfeasibility",
+    "TrialRun",
     "WindowPool",
     "options_of",
+    "run_trials",
 ]

@@ -19,7 +19,7 @@ from mhe.distributed.plan import ArrivalSchedule, NodePlan
 from mhe.distributed.pool import WindowPool
 from mhe.observers import ObserverGain, given_gain, kalman_gain, minimal_radius_gain
 from mhe.polyhedron import Polyhedron
-from problems.errors import DefinitionError, ModelWarning, SettingError, ShapeError, TopologyError
+from problems.errors import DefinitionError, ModelWarning, SettingError, ShapeError
 from problems.models import LinearModel, Model
 from problems.networks import (
     Network,

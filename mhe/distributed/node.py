@@ -20,6 +20,7 @@ from mhe.covariance import (
     symmetrized,
     window_information,
 )
+from mhe.distributed.fallback import SOLVED, STOPPED, Fallback, predicted
 from mhe.distributed.plan import NodePlan
 from mhe.distributed.pool import WindowPool
 from mhe.estimate import Estimate
@@ -27,11 +28,7 @@ from problems.errors import DataError, ShapeError
 from problems.runtime import Message, NeighborMemory, Outgoing, Schema
 from problems.runtime.message import Field
 from problems.solvers.base import Status
-from problems.solvers.session import Session, Solution
-
-SOLVED = (Status.SOLVED, Status.INACCURATE)
-STOPPED = (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
-VIOLATED = 1e-6  # slack beyond which a soft bound counts as not met
+from problems.solvers.session import Session
 
 
 class DistributedNode:
@@ -58,7 +55,9 @@ class DistributedNode:
         self._model, self._horizon = model, options.horizon
         self._window, base = self._pool.get(model, plan.gain, options, plan.state_bounds, plan.disturbance_bounds)
         self._session: Session = base.fork()
-        self._soft: Session | None = None
+        self._fallback = Fallback(
+            self._pool, model, plan.gain, options, plan.state_bounds, plan.disturbance_bounds, self._window.bounds
+        )
         n = model.state_size
         own = plan.member_rows[plan.own]
         self._own_size = own.stop - own.start
@@ -344,39 +343,14 @@ class DistributedNode:
         if status in SOLVED or (status in STOPPED and solution.iterations):
             self._states = solution["x"]
             return status, ()
-        self._states = self._predicted(before)
+        self._states = predicted(self._model, before, self._u, self._newest, self._slid)
         if status is not Status.INFEASIBLE:
             return Status.FAILED if status in STOPPED else status, ()
-        return status, self._relaxed()
-
-    def _predicted(self, before: np.ndarray) -> np.ndarray:
-        """The window before, moved on by the model without disturbance."""
-        newest = self._newest
-        states = np.vstack([before[1:], before[-1:]]) if self._slid else before.copy()
-        for k in range(newest, self._horizon + 1):
-            states[k] = self._model.A @ states[k - 1] + self._model.B @ self._u[k]
-        return states
-
-    def _relaxed(self) -> tuple[str, ...]:
-        """Solve with slacks where that was asked for; names of the bounds that are not met."""
-        plan, names = self._plan, tuple(f"{name} bounds" for name in self._window.bounds)
-        if plan.options.infeasible == "predict":
-            return names
-        if self._soft is None:
-            bounds = plan.state_bounds, plan.disturbance_bounds
-            self._soft = self._pool.get(self._model, plan.gain, plan.options, *bounds, soft=True)[1].fork()
         store = self._session.store
         inputs = self._session.problem.inputs.items()
-        solution: Solution = self._soft.solve({name: store[name] for name, entry in inputs if entry.of is None})
-        if solution.status not in SOLVED:
-            return names
-        self._states = solution["x"]
-        filled = self._newest + 1
-        return tuple(
-            f"{name} bounds"
-            for name in self._window.bounds
-            if solution[f"{name} slack"][: filled - (name == "disturbance")].max(initial=0.0) > VIOLATED
-        )
+        data = {name: store[name] for name, entry in inputs if entry.of is None}
+        self._states, unmet = self._fallback(data, self._states, self._newest)
+        return status, tuple(unmet)
 
 
 def schemas(measurements: int, states: int, online: bool) -> tuple[Schema, Schema]:

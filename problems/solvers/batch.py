@@ -7,22 +7,24 @@ fork per entry behind the same interface.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from problems.errors import DataError, ShapeError, UnknownNameError
-from problems.forms.layout import Layout, data_rows
+from problems.forms.layout import DataStore, Layout, data_rows
 from problems.forms.quadratic import clean
+from problems.problem import DataSlot
 from problems.solvers.base import Status
+from problems.solvers.qp_maps import DenseMap, SparseMap
 from problems.solvers.session import Session, Solution
 
 if TYPE_CHECKING:
     from problems.solvers.qp_session import QPSession
-
-Maps = "DenseMap | SparseMap"
 
 
 class BatchSolution:
@@ -79,7 +81,11 @@ class BatchSession:
         self.given = dict(session.store.given)
 
     def update(self, **data: Any) -> None:
-        """Take data of all entries: with a leading axis (count, ...), or one value shared by all."""
+        """Take data with a leading axis (count, ...), or one value shared by all entries.
+
+        A leading axis (b, ...) with b a divisor of the count gives one value to each of b blocks of consecutive
+        entries. Weights and matrices of few blocks are cheaper than the same ones entry by entry.
+        """
         for name, value in data.items():
             self._set(name, value)
 
@@ -95,20 +101,29 @@ class BatchSession:
         solution.seconds = {"solve": time.perf_counter() - start}
         return solution
 
+    def data_of(self, entry: int) -> dict[str, np.ndarray]:
+        """Data of one entry by name, as `Session.solve` takes them."""
+        store = self._store(entry)
+        return {name: store[name].copy() for name, datum in self.layout.problem.inputs.items() if datum.of is None}
+
+    def _store(self, entry: int) -> DataStore:
+        raise NotImplementedError
+
     def _rows(self, name: str, value: Any) -> np.ndarray:
-        """(count or 1, numbers of the datum)."""
+        """(blocks, numbers of the datum), blocks = 1 where all entries share it."""
         entry = self.layout.problem.inputs.get(name)
         if entry is None:
             raise UnknownNameError("data", name, self.layout.problem.inputs)
         array = np.asarray(value, dtype=float)
-        full = (self.count, *(() if entry.count is None else (entry.count,)), *entry.shape)
-        if array.shape == full:
-            return array.reshape(self.count, entry.rows * entry.size)
+        one = (*(() if entry.count is None else (entry.count,)), *entry.shape)
+        if array.shape[1:] == one and array.ndim == len(one) + 1 and array.shape[0] and not self.count % array.shape[0]:
+            return array.reshape(array.shape[0], entry.rows * entry.size)
         try:
             return np.array(data_rows(entry, array)).reshape(1, -1)
         except ShapeError:
             raise ShapeError(
-                f"data {name!r}: expected shape {full} (one per entry) or {full[1:]} (shared), got {array.shape}"
+                f"data {name!r}: expected shape {(self.count, *one)} (one per entry), {one} (shared) or a first axis "
+                f"that divides {self.count} (one per block), got {array.shape}"
             ) from None
 
     def _set(self, name: str, value: Any) -> None:
@@ -129,14 +144,26 @@ class ForkBatch(BatchSession):
         rows = self._rows(name, value)
         entry = self.layout.problem.inputs[name]
         for k, fork in enumerate(self.forks):
-            fork.update(**{name: rows[k % rows.shape[0]].reshape(entry.rows, entry.size)})
+            fork.update(**{name: rows[k * rows.shape[0] // self.count].reshape(entry.rows, entry.size)})
         self.given[name] = True
+
+    def _store(self, entry: int) -> DataStore:
+        return self.forks[entry].store
 
     def _solve(self) -> BatchSolution:
         out = BatchSolution(self.layout, np.empty((self.count, self.layout.stored_size)), self.session.solver)
         for k, fork in enumerate(self.forks):
             out.take(k, fork.solve())
         return out
+
+
+@dataclass(eq=False)
+class Group:
+    """Entries with equal weights, matrices and pattern: a session that holds these, and the map."""
+
+    entries: np.ndarray
+    session: QPSession
+    map: DenseMap | SparseMap
 
 
 class QPBatch(BatchSession):
@@ -150,80 +177,158 @@ class QPBatch(BatchSession):
         program = session.program
         starts, inputs = self.layout.data_start, self.layout.problem.inputs
         self._slices = {n: slice(starts[n], starts[n] + e.rows * e.size) for n, e in inputs.items()}
+        self._slow_names = session.slow | session.switching
         slow = [np.arange(self._slices[n].start, self._slices[n].stop) for n in session.slow]
         self._slow = np.concatenate([*slow, program.activity.switches]) if slow else program.activity.switches
         self._presence = {e.of.name: n for n, e in inputs.items() if e.of is not None}
-        self._groups: list[tuple[np.ndarray, QPSession, Any]] | None = None
+        self._may_be_infinite = {
+            value.source.name
+            for term in session.problem.terms.values()
+            for value in (term.lower, term.upper)
+            if isinstance(value, DataSlot)
+        }
+        # numbers of blocks that weights and matrices came in; what is not finite, by name
+        self._blocks = dict.fromkeys(self._slow_names, 1)
+        self._missing: dict[str, np.ndarray] = {}
+        self._infinite: set[str] = set()
+        for name, part in self._slices.items():
+            self._note_missing(name, self.numbers[:1, part])
+        self._groups: list[Group] | None = None
+        self._stacked: StackedMaps | None = None
+        self._forks: list[QPSession] = []
         self._last: dict[int, Any] = {}
-        self._missing = False
 
     def _set(self, name: str, value: Any) -> None:
         rows = self._rows(name, value)
-        part = self._slices[name]
-        entry = self.layout.problem.inputs[name]
-        missing = bool(np.isnan(rows).any())
-        slow = name in self.session.slow or name in self.session.switching
-        if self._groups is not None and (missing or self._missing or slow):
-            before = self.numbers[:, part]
-            if slow and not np.array_equal(before, np.broadcast_to(rows, before.shape), equal_nan=True):
+        blocks, part = rows.shape[0], self._slices[name]
+        view = self.numbers[:, part].reshape(blocks, self.count // blocks, -1)
+        given = rows[:, None]
+        if name in self._slow_names:
+            self._blocks[name] = blocks
+            if not np.array_equal(view, np.broadcast_to(given, view.shape), equal_nan=True):
                 self._groups = None
-            elif not np.array_equal(np.isnan(before), np.broadcast_to(np.isnan(rows), before.shape)):
-                self._groups = None
-        self.numbers[:, part] = rows
+        if self._note_missing(name, rows):
+            self._groups = None
+        view[...] = given
         self.given[name] = True
         if name in self._presence:
+            entry = self.layout.problem.inputs[name]
             flags = ~np.isnan(self.numbers[:, part].reshape(self.count, entry.rows, entry.size)).any(axis=2)
             self.numbers[:, self._slices[self._presence[name]]] = flags
-        self._missing = self._missing or missing
 
-    def _grouped(self) -> list[tuple[np.ndarray, QPSession, Any]]:
-        """Entries that share a map: their numbers, a session holding their weights, the map."""
-        if self._groups is not None:
-            return self._groups
-        self._missing = bool(np.isnan(self.numbers).any())
-        keys = [np.ascontiguousarray(self.numbers[:, self._slow])]
-        if self._missing:
-            keys.append(np.isnan(self.numbers).astype(float))
-        key = np.ascontiguousarray(np.hstack(keys))
-        if key.shape[1]:
-            _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-            inverse = inverse.ravel()
-        else:
-            first, inverse = np.zeros(1, int), np.zeros(self.count, int)
-        order = np.argsort(inverse, kind="stable")
-        parts = np.split(order, np.cumsum(np.bincount(inverse))[:-1])
-        groups = []
-        for entries, k in zip(parts, first, strict=True):
-            fork = self.session.fork()
-            fork.adopt(self.numbers[k])
-            groups.append((entries, fork, fork.current_map()))
-        self._groups = groups
-        return groups
+    def _store(self, entry: int) -> DataStore:
+        return self.session.store.copy(self.numbers[entry])
+
+    def _note_missing(self, name: str, rows: np.ndarray) -> bool:
+        """Keep track of numbers that are not finite; whether the pattern of missing ones changed."""
+        known = self._missing.pop(name, None)
+        self._infinite.discard(name)
+        if np.isfinite(rows.sum()):
+            return known is not None
+        missing = np.isnan(rows)
+        if np.isinf(rows).any():
+            if name not in self._may_be_infinite:
+                raise DataError(f"data {name!r} have an infinite value")
+            self._infinite.add(name)
+        if not missing.any():
+            return known is not None
+        self._missing[name] = missing
+        return known is None or known.shape != missing.shape or not np.array_equal(known, missing)
 
     def _solve(self) -> BatchSolution:
         groups = self._grouped()
-        finite = np.isfinite(self.numbers).all()
-        numbers = self.numbers if finite else clean(self.numbers)
+        numbers = clean(self.numbers) if self._missing or self._infinite else self.numbers
         out = BatchSolution(self.layout, np.empty((self.count, self.layout.size)), "linear")
-        for entries, fork, map_ in groups:
-            whole = entries.size == self.count
-            rows = numbers if whole else numbers[entries]
-            if not (map_.definite and fork.screens):
-                violated = np.arange(entries.size)
-            else:
-                z, excess = map_.many(rows)
-                out.point[slice(None) if whole else entries] = z
+        tolerance = self.session.options.tolerance
+        if self._stacked is not None:
+            entries, violated = self._stacked(numbers, out.point, tolerance)
+            for place in violated:
+                group = groups[place // entries.shape[1]]
+                self._one(group, int(entries.flat[place]), out)
+            return out
+        for group in groups:
+            map_, entries = group.map, group.entries
+            if map_.definite and group.session.screens:
+                z, excess = map_.many(numbers[entries])
+                out.point[entries] = z
                 if not excess.shape[1]:
                     continue
-                violated = np.flatnonzero(excess.max(axis=1) > self.session.options.tolerance)
-            for v in violated:
-                entry = int(entries[v])
-                out.take(entry, self._one(fork, entry))
+                entries = entries[excess.max(axis=1) > tolerance]
+            for entry in entries:
+                self._one(group, int(entry), out)
         return out
 
-    def _one(self, fork: QPSession, entry: int) -> Solution:
-        fork.adopt(self.numbers[entry], same_map=True)
-        fork.last = self._last.get(entry)
-        solution = fork.solve_screened_out()
-        self._last[entry] = fork.last
-        return solution
+    def _one(self, group: Group, entry: int, out: BatchSolution) -> None:
+        """Solve one entry by the backend."""
+        session = group.session
+        session.adopt(self.numbers[entry], same_map=True)
+        session.last = self._last.get(entry)
+        out.take(entry, session.solve_screened_out())
+        self._last[entry] = session.last
+
+    def _grouped(self) -> list[Group]:
+        """Entries that share a map."""
+        if self._groups is None:
+            parts = self._parts()
+            while len(self._forks) < len(parts):
+                self._forks.append(self.session.fork())
+            self._groups = []
+            for entries, fork in zip(parts, self._forks, strict=False):
+                fork.adopt(self.numbers[entries[0]])
+                self._groups.append(Group(entries, fork, fork.current_map()))
+            self._stacked = StackedMaps.of(self._groups)
+        return self._groups
+
+    def _parts(self) -> list[np.ndarray]:
+        blocks = math.lcm(*self._blocks.values()) if self._blocks else 1
+        patterns = math.lcm(*(missing.shape[0] for missing in self._missing.values())) if self._missing else 1
+        if blocks < self.count or self.count == 1:
+            uniform = all((missing == missing[0]).all() for missing in self._missing.values())
+            if uniform or not blocks % patterns:
+                return list(np.arange(self.count).reshape(blocks, -1))
+        key = self.numbers[:, self._slow]
+        if self._missing:
+            key = np.hstack([key, np.isnan(self.numbers)])
+        _, inverse = np.unique(key, axis=0, return_inverse=True)
+        inverse = inverse.ravel()
+        order = np.argsort(inverse, kind="stable")
+        return np.split(order, np.cumsum(np.bincount(inverse))[:-1])
+
+
+class StackedMaps:
+    """Affine maps of groups of equal size, applied by one stacked product.
+
+    Attributes:
+        entries: (groups, entries per group).
+    """
+
+    def __init__(self, groups: list[Group], maps: list[DenseMap]) -> None:
+        self.entries = np.array([group.entries for group in groups])
+        self._size = maps[0].size
+        self._T = np.array([map_.T for map_ in maps]) if len(maps) > 1 else maps[0].T[None]
+        self._t = np.array([map_.t for map_ in maps])[:, None]
+        self._in_order = bool((self.entries.ravel() == np.arange(self.entries.size)).all())
+
+    @classmethod
+    def of(cls, groups: list[Group]) -> StackedMaps | None:
+        """None where the groups are unequal or have no affine answer."""
+        maps = [group.map for group in groups if isinstance(group.map, DenseMap) and group.map.definite]
+        if len(maps) < len(groups) or not groups[0].session.screens:
+            return None
+        alike = len({group.entries.size for group in groups}) == len({map_.T.shape for map_ in maps}) == 1
+        return cls(groups, maps) if alike else None
+
+    def __call__(self, numbers: np.ndarray, point: np.ndarray, tolerance: float) -> tuple[np.ndarray, list[int]]:
+        """Fill `point`; the entries and the flat places among them that violate a row."""
+        rows = numbers if self._in_order else numbers[self.entries.ravel()]
+        out = rows.reshape(*self.entries.shape, -1) @ self._T.transpose(0, 2, 1)
+        out += self._t
+        flat = out.reshape(self.entries.size, -1)
+        if self._in_order:
+            point[...] = flat[:, : self._size]
+        else:
+            point[self.entries.ravel()] = flat[:, : self._size]
+        if flat.shape[1] == self._size:
+            return self.entries, []
+        excess = flat[:, self._size :].max(axis=1)
+        return self.entries, np.flatnonzero(excess > tolerance).tolist()

@@ -1,0 +1,79 @@
+"""What a node estimates where its window has no solution: the prediction, or bounds relaxed by slacks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mhe.distributed.options import DistributedOptions
+from mhe.distributed.pool import WindowPool
+from mhe.polyhedron import Polyhedron
+from problems.models import LinearModel
+from problems.solvers.base import Status
+from problems.solvers.session import Session
+
+SOLVED = (Status.SOLVED, Status.INACCURATE)
+STOPPED = (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
+VIOLATED = 1e-6  # slack beyond which a soft bound counts as not met
+
+
+def predicted(model: LinearModel, before: np.ndarray, inputs: np.ndarray, newest: int, slid: bool) -> np.ndarray:
+    """The window before, moved on by the model without disturbance.
+
+    Args:
+        before: states (slots, n) of the step before.
+        inputs: (slots, m), row k acted up to slot k.
+        newest: slot of the newest instant.
+        slid: whether the oldest instant left.
+    """
+    states = np.vstack([before[1:], before[-1:]]) if slid else before.copy()
+    for k in range(newest, len(states)):
+        states[k] = model.A @ states[k - 1] + model.B @ inputs[k]
+    return states
+
+
+class Fallback:
+    """Answers infeasible windows of one local problem as ``options.infeasible`` says.
+
+    Args:
+        pool, model, gain, options, state_bounds, disturbance_bounds: as for `WindowPool.get`.
+        bounds: names of the window's bounds.
+    """
+
+    def __init__(
+        self,
+        pool: WindowPool,
+        model: LinearModel,
+        gain: np.ndarray | None,
+        options: DistributedOptions,
+        state_bounds: Polyhedron | None,
+        disturbance_bounds: Polyhedron | None,
+        bounds: tuple[str, ...],
+    ) -> None:
+        self._pool = pool
+        self._problem = model, gain, options, state_bounds, disturbance_bounds
+        self._soft = options.infeasible == "soft"
+        self._names = bounds
+        self._session: Session | None = None
+
+    def __call__(self, data: Mapping[str, Any], prediction: np.ndarray, newest: int) -> tuple[np.ndarray, list[str]]:
+        """States (slots, n) and the names of the bounds that could not be met.
+
+        Args:
+            data: all data of the window that is infeasible.
+            prediction: states (slots, n) where nothing better is found.
+            newest: slot of the newest instant.
+        """
+        everything = [f"{name} bounds" for name in self._names]
+        if not self._soft:
+            return prediction, everything
+        if self._session is None:
+            self._session = self._pool.get(*self._problem, soft=True)[1].fork()
+        solution = self._session.solve(data)
+        if solution.status not in SOLVED:
+            return prediction, everything
+        slots = {"state": newest + 1, "disturbance": newest}
+        unmet = [name for name in self._names if solution[f"{name} slack"][: slots[name]].max(initial=0.0) > VIOLATED]
+        return solution["x"], [f"{name} bounds" for name in unmet]
