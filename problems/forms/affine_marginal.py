@@ -24,7 +24,8 @@ class AffineMarginal:
         program, self._plan = plan.program, plan.plan
         order = self._plan.columns
         reduced = program.reduced(numbers)
-        P, Q, q0 = reduced.weighted(store, program.flags(store.numbers))
+        pattern = program.activity.key(store.numbers)
+        P, Q, q0 = reduced.weighted(store, program.flags(store.numbers), pattern)
         gradient = np.column_stack([Q, q0])[order]
         E = np.column_stack([reduced.E, reduced.c])
         self.M, linear = schur(P[np.ix_(order, order)], gradient, reduced.A[:, order], E, self._plan.drop)
