@@ -33,7 +33,7 @@ class HiGHSSettings:
             own 1e-7 spoils the dual residual.
         time_limit: seconds of one solve.
         presolve: whether the library simplifies the problem first.
-        threads: threads, 0 for the library's choice.
+        threads: threads, 0 for the library's choice; one number per process, the library refuses a second one.
     """
 
     primal_feasibility_tolerance: float | None = None

@@ -83,7 +83,7 @@ class QP:
         P, A = self.matrices(cls)
         return cls(P, self.q, A, self.l, self.u, Options(**options))
 
-    def judged(self, backend: Any, tolerance: float = 1e-8, warm: Any = None) -> tuple[Status, QPResult]:
+    def judged(self, backend: Any, tolerance: float = 1e-8, warm: Any = None) -> tuple[Status, Any]:
         result = backend.solve(self.q, self.l, self.u, warm)
         assert isinstance(result, QPResult)
         P, A = self.matrices(type(backend))
@@ -100,7 +100,7 @@ class QP:
             complementarity = max(complementarity, min(abs(multiplier), abs(slack)))
         return max(stationarity, feasibility, complementarity)
 
-    def enumerated(self) -> np.ndarray | None:
+    def enumerated(self) -> Any:
         """The minimiser, by solving the equality problem of every active set; None if there is none."""
         n, m = len(self.q), len(self.l)
         choices = []
@@ -883,7 +883,7 @@ def solution() -> tuple[QP, np.ndarray, np.ndarray]:
     return qp, np.array([1.0, -0.5]), np.array([2.0, 0.0])
 
 
-def verdict(qp: QP, result: QPResult, tolerance: float = 1e-8, sparse: bool = False) -> tuple[Status, QPResult]:
+def verdict(qp: QP, result: QPResult, tolerance: float = 1e-8, sparse: bool = False) -> tuple[Status, Any]:
     P, A = (sp.csc_array(qp.P), sp.csc_array(qp.A)) if sparse else (qp.P, qp.A)
     return judge(result, P, qp.q, A, qp.l, qp.u, tolerance)
 
