@@ -97,14 +97,15 @@ def template_of(term: Term) -> Template:
 def _template(residual: Callable[..., Any], spaces: tuple[Space, ...], shapes: tuple[tuple[int, ...], ...]) -> Template:
     x = tuple(ca.SX.sym(f"x{i}", space.ambient) for i, space in enumerate(spaces))
     d = tuple(ca.SX.sym(f"d{i}", int(np.prod(shape, dtype=int))) for i, shape in enumerate(shapes))
-    elements = [space.element(xi) for space, xi in zip(spaces, x, strict=True)]
+    deltas = tuple(ca.SX.sym(f"delta{i}", space.dim) for i, space in enumerate(spaces))
+    elements = [_displaced(space, xi, di) for space, xi, di in zip(spaces, x, deltas, strict=True)]
     rows = [_shaped(di, shape) for di, shape in zip(d, shapes, strict=True)]
-    r = _column(_call(residual, elements, rows))
-    allowed = [*x, *d]
-    free = [s.name() for s in ca.symvar(r) if not any(ca.depends_on(a, s) for a in allowed)]
+    moved = _column(_call(residual, elements, rows))
+    allowed = [*x, *d, *deltas]
+    free = [s.name() for s in ca.symvar(moved) if not any(ca.depends_on(a, s) for a in allowed)]
     if free:
         raise DefinitionError(f"the residual contains symbols that are neither slots nor data: {', '.join(free)}")
-    jacobian = _tangent_jacobian(r, x, spaces)
+    r, jacobian = _differentiate(moved, x, deltas, spaces)
     affine = all(isinstance(space, Vector) for space in spaces) and is_affine_in(r, ca.vertcat(*x))
     return Template(x, d, r, jacobian, tuple(space.dim for space in spaces), affine)
 
@@ -173,13 +174,21 @@ def _column(value: Any) -> ca.SX:
     return r
 
 
-def _tangent_jacobian(r: ca.SX, x: tuple[ca.SX, ...], spaces: tuple[Space, ...]) -> ca.SX:
-    blocks = []
-    for xi, space in zip(x, spaces, strict=True):
-        block = ca.jacobian(r, xi)
-        if not isinstance(space, Vector):
-            delta = ca.SX.sym("delta", space.dim)
-            chart = ca.substitute(ca.jacobian(space.retract(xi, delta), delta), delta, ca.SX.zeros(space.dim))
-            block = block @ ca.sparsify(chart)
-        blocks.append(block)
-    return ca.simplify(ca.horzcat(*blocks)) if len(blocks) > 1 else ca.simplify(blocks[0])
+def _displaced(space: Space, x: ca.SX, delta: ca.SX) -> Any:
+    """The element at x moved by delta; a space may offer one that is exact to first order and simplifies better."""
+    if isinstance(space, Vector):
+        return space.element(x)
+    displaced = getattr(space, "displaced", None)
+    return space.element(space.retract(x, delta)) if displaced is None else displaced(x, delta)
+
+
+def _differentiate(
+    moved: ca.SX, x: tuple[ca.SX, ...], deltas: tuple[ca.SX, ...], spaces: tuple[Space, ...]
+) -> tuple[ca.SX, ca.SX]:
+    """Residual and tangent Jacobian at the undisplaced elements."""
+    by = [xi if isinstance(space, Vector) else di for xi, di, space in zip(x, deltas, spaces, strict=True)]
+    every = ca.vertcat(*deltas)
+    slopes = ca.horzcat(*(ca.jacobian(moved, symbols) for symbols in by))
+    still = ca.SX.zeros(every.shape[0])
+    r, jacobian = ca.substitute([moved, slopes], [every], [still])
+    return ca.densify(r), ca.simplify(ca.sparsify(jacobian))
