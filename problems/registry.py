@@ -12,7 +12,7 @@ from typing import Any
 
 from problems.errors import MissingExtraError, SettingError, UnknownNameError
 
-KINDS = ("solvers", "estimators", "scenarios", "readers", "commands")
+KINDS = ("solvers", "estimators", "scenarios", "readers", "commands", "native_factors")
 
 
 @lru_cache(maxsize=None)

@@ -44,7 +44,7 @@ class Solution:
         objective: cost at the point, losses included.
         iterations: of the solver; 0 where a linear solve answered.
         method: what answered: a solver's name, or ``linear``.
-        seconds: ``{"update", "solve"}`` of this call.
+        seconds: ``{"update", "solve"}`` of this call, and ``setup`` where a solver built its own model of the data.
         message: for people; says why when the status is not ``solved``.
         point: all stored coordinates.
     """
@@ -169,7 +169,8 @@ class Session(ABC):
         if initial is not None:
             self._point = self.layout.point(initial, self._point)
         solution = self._solve()
-        solution.seconds = {"update": self._update_seconds, "solve": time.perf_counter() - start}
+        spent = time.perf_counter() - start - sum(solution.seconds.values())
+        solution.seconds |= {"update": self._update_seconds, "solve": spent}
         self._update_seconds = 0.0
         if solution.status in _USABLE:
             self._point = solution.point

@@ -1,0 +1,59 @@
+"""gtsam's own factors for the measurement templates of `localization.measurements`.
+
+gtsam orders bearing before range, stores what it measures as group elements, and has no chordal residuals: those become
+custom factors. Spec ``gps-range-bearing-localization`` 7.4.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from localization import measurements as meas
+from problems.forms.native_factors import register_native
+from problems.spaces import SE2, SO2, Vector
+
+POINT2, POINT3 = Vector(2), Vector(3)
+
+
+def _pose(z: np.ndarray) -> gtsam.Pose2:
+    return gtsam.Pose2(z[0], z[1], z[2])
+
+
+register_native(meas.position, (SE2,), lambda i, z, noise: gtsam.PoseTranslationPrior2D(i, z, noise))
+register_native(meas.heading, (SE2,), lambda i, z, noise: gtsam.PoseRotationPrior2D(i, gtsam.Rot2(z[0]), noise))
+register_native(meas.heading, (SO2,), lambda i, z, noise: gtsam.PriorFactorRot2(i, gtsam.Rot2(z[0]), noise))
+register_native(meas.pose_log, (SE2,), lambda i, z, noise: gtsam.PriorFactorPose2(i, _pose(z), noise))
+register_native(
+    meas.relative_pose_log, (SE2, SE2), lambda i, j, z, noise: gtsam.BetweenFactorPose2(i, j, _pose(z), noise)
+)
+for _space in (Vector(1), POINT2, POINT3):
+    register_native(meas.position, (_space,), lambda i, z, noise: gtsam.PriorFactorVector(i, z, noise))
+    register_native(
+        meas.relative_position, (_space, _space), lambda i, j, z, noise: gtsam.BetweenFactorVector(i, j, z, noise)
+    )
+
+register_native(meas.distance, (SE2, SE2), lambda i, j, z, noise: gtsam.RangeFactorPose2(i, j, z[0], noise))
+register_native(meas.distance, (SE2, POINT2), lambda i, j, z, noise: gtsam.RangeFactor2D(i, j, z[0], noise))
+register_native(meas.distance, (POINT2, SE2), lambda i, j, z, noise: gtsam.RangeFactor2D(j, i, z[0], noise))
+register_native(meas.distance, (POINT2, POINT2), lambda i, j, z, noise: gtsam.RangeFactor2(i, j, z[0], noise))
+register_native(meas.distance, (POINT3, POINT3), lambda i, j, z, noise: gtsam.RangeFactor3(i, j, z[0], noise))
+
+register_native(
+    meas.bearing, (SE2, SE2), lambda i, j, z, noise: gtsam.BearingFactorPose2(i, j, gtsam.Rot2(z[0]), noise)
+)
+register_native(
+    meas.bearing, (SE2, POINT2), lambda i, j, z, noise: gtsam.BearingFactor2D(i, j, gtsam.Rot2(z[0]), noise)
+)
+register_native(
+    meas.bearing_range,
+    (SE2, SE2),
+    lambda i, j, z, noise: gtsam.BearingRangeFactorPose2(i, j, gtsam.Rot2(z[1]), z[0], noise),
+    order=(1, 0),
+)
+register_native(
+    meas.bearing_range,
+    (SE2, POINT2),
+    lambda i, j, z, noise: gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(z[1]), z[0], noise),
+    order=(1, 0),
+)
