@@ -43,7 +43,8 @@ class Gaussian:
             raise NoiseError(
                 f"Gaussian takes exactly one of sigma, covariance, information; got {[k for k, _ in given] or 'none'}"
             )
-        self.kind, self.value = given[0]
+        self.kind: Kind = given[0][0]
+        self.value: Any = given[0][1]
 
     def __repr__(self) -> str:
         return f"Gaussian({self.kind}={self.value!r})"

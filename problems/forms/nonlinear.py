@@ -18,7 +18,7 @@ import numpy as np
 
 from problems.forms.kernels import cost_kernel, gate
 from problems.forms.layout import Activity, DataStore, Layout, TermLayout, constant_rows
-from problems.forms.least_squares import Constraints, whitening_numbers
+from problems.forms.least_squares import Constraints, Flags, whitening_numbers
 from problems.forms.sparsity import HessianPattern
 from problems.forms.template import Template, template_of
 from problems.noise import Loss
@@ -53,10 +53,15 @@ def _kernel(outputs: ca.SX, reference: ca.SX, step: ca.SX, rest: ca.SX, on: ca.S
     places, pairs = (tuple(zip(*m.sparsity().get_triplet(), strict=True)) for m in (first, second))
     hessian = None
     if pairs:
-        hessian = ca.Function("hessian", [*inputs, weights], [ca.cse(ca.vertcat(*second.nonzeros()))])
-    flat = ca.vertcat(*first.nonzeros()) if places else ca.SX(0, 1)
+        hessian = ca.Function("hessian", [*inputs, weights], [ca.cse(_entries(second))])
+    flat = _entries(first)
     both = ca.Function("both", inputs, ca.cse([value, flat]))
     return _Kernel(ca.Function("value", inputs, [ca.cse(value)]), both, hessian, places, pairs)
+
+
+def _entries(matrix: ca.SX) -> ca.SX:
+    """The nonzero entries as a column, column by column."""
+    return ca.vertcat(*(matrix.nz[k] for k in range(matrix.nnz()))) if matrix.nnz() else ca.SX(0, 1)
 
 
 def _moved(template: Template, spaces: tuple[Space, ...]) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -139,13 +144,11 @@ class NonlinearProgram:
         store.require_all()
         return store
 
-    def flags(self, store: DataStore) -> dict[str, np.ndarray | None]:
+    def flags(self, store: DataStore) -> Flags:
         """Active instances (count,) of each term by name; None where all are."""
         return dict(zip(self._names, self.activity.flags(store.numbers), strict=True))
 
-    def parameters(
-        self, store: DataStore, reference: np.ndarray, flags: Mapping[str, np.ndarray | None] | None = None
-    ) -> np.ndarray:
+    def parameters(self, store: DataStore, reference: np.ndarray, flags: Flags | None = None) -> np.ndarray:
         """Numbers of `parameter` for given data around the point `reference` (all stored coordinates)."""
         flags = self.flags(store) if flags is None else flags
         parts = [reference, np.nan_to_num(store.numbers, nan=0.0)]
@@ -157,9 +160,7 @@ class NonlinearProgram:
             parts.append(np.ones(entry.term.count) if on is None else on.astype(float))
         return np.concatenate(parts)
 
-    def bounds(
-        self, store: DataStore, flags: dict[str, np.ndarray | None] | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def bounds(self, store: DataStore, flags: Flags | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of g; infinite for instances that are off."""
         return self._constraints.bounds(store.numbers, self.flags(store) if flags is None else flags)
 
@@ -274,7 +275,8 @@ class _Mapped:
         return self.kernel.value.map(self.entry.term.count)(*self.inputs)
 
     def both(self) -> tuple[ca.MX, ca.MX]:
-        return self.kernel.both.map(self.entry.term.count)(*self.inputs)
+        value, slopes = self.kernel.both.map(self.entry.term.count)(*self.inputs)  # type: ignore[misc]
+        return value, slopes
 
     def hessian(self, weights: ca.MX) -> ca.MX:
         assert self.kernel.hessian is not None

@@ -10,13 +10,14 @@ import io
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib import metadata
 from typing import Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
 
 from problems.errors import SettingError
-from problems.forms.least_squares import Constraints, LeastSquares
+from problems.forms.least_squares import Constraints, Flags, LeastSquares
 from problems.forms.nonlinear import NonlinearProgram
 from problems.forms.pins import Pins
 from problems.problem import Problem
@@ -103,7 +104,7 @@ class NLPSession(Session):
 
     @classmethod
     def version(cls) -> str:
-        return str(ca.__version__)
+        return metadata.version("casadi")
 
     def reset(self) -> None:
         super().reset()
@@ -140,7 +141,7 @@ class NLPSession(Session):
         return Solution(self.layout, point, status, self.solver, check, iterations, message)
 
     def _run(
-        self, reference: np.ndarray, flags: dict[str, np.ndarray | None], lower: np.ndarray, upper: np.ndarray
+        self, reference: np.ndarray, flags: Flags, lower: np.ndarray, upper: np.ndarray
     ) -> tuple[np.ndarray, Status, str, int, np.ndarray | None]:
         """Point, claim, message, iterations, multipliers; multipliers None where the point is none."""
         parameters = self.program.parameters(self.store, reference, flags)

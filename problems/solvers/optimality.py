@@ -3,10 +3,11 @@
 With g and H the gradient and the Gauss-Newton Hessian of the costs at the point (tangent coordinates), y the
 multipliers of the inequalities with impossible signs cut off, and ``r = g + J'y``, the *decrement* is
 
-    max over d with (Jacobian of the equalities) d = 0 of  -r'd - d'Hd/2   +   sum of y times distance to its bound.
+    max over d with (Jacobian of the equalities) d = 0 of  -r'd - d'Hd/2   +   sum of |y| times distance to its bound,
 
-For a convex problem it bounds how far the cost is above its minimum; without constraints it is half the squared Newton
-decrement (Boyd and Vandenberghe, Convex Optimization, 9.5.1).
+where the sum is over inequalities and, with the multipliers of that maximum, equalities. For a convex problem it
+bounds how far the cost is from its minimum; without constraints it is half the squared Newton decrement (Boyd and
+Vandenberghe, Convex Optimization, 9.5.1).
 """
 
 from __future__ import annotations
@@ -77,22 +78,23 @@ def optimality(
 
     Args:
         constraints: all but the pinned ones.
-        pins: fixed instances, which `point` satisfies.
+        pins: fixed instances, onto which `point` was moved.
         multipliers: of the rows of `constraints`, positive at an upper bound; those of equalities are not used.
     """
     pattern = form.pattern
     cost, gradient, hessian = bound.linearize(point)
     pins.reduce(gradient, hessian, pattern)
-    values, entries = constraints.evaluate(point, bound.numbers)
+    values, entries = constraints.evaluate(point, bound.numbers, bound.flags)
     touched = np.zeros(pattern.size, bool)
-    touched[constraints.columns] = True
+    touched[constraints.columns[entries != 0]] = True
     free = form.layout.names_of(((hessian[pattern.diagonal] <= 0) & ~touched).astype(float))
     if not (np.isfinite(cost) and np.isfinite(gradient).all() and np.isfinite(hessian).all()):
         return Optimality(float("nan"), float("nan"), float("nan"), free)
+    violation = pins.violation(point, bound.numbers)
     if not constraints.size:
-        return Optimality(cost, _decrement(pattern, hessian, gradient), 0.0, free)
+        return Optimality(cost, _decrement(pattern, hessian, gradient), violation, free)
     lower, upper = constraints.bounds(bound.numbers, bound.flags)
-    violation = float(np.maximum(np.maximum(values - upper, lower - values), 0.0).max())
+    violation = float(np.max([violation, *np.maximum(np.maximum(values - upper, lower - values), 0.0)]))
     y = np.zeros(constraints.size) if multipliers is None else multipliers.copy()
     y[: constraints.equalities] = 0.0
     limit = np.where(y > 0, upper, lower)
@@ -102,7 +104,9 @@ def optimality(
     dual[pins.columns] = 0.0
     if not constraints.equalities:
         return Optimality(cost, _decrement(pattern, hessian, dual) + gap, violation, free)
-    return Optimality(cost, _constrained(pattern, hessian, dual, constraints, entries, pins) + gap, violation, free)
+    share, multipliers = _constrained(pattern, hessian, dual, constraints, entries, pins)
+    gap += float(np.abs(multipliers * values[: constraints.equalities]).sum())
+    return Optimality(cost, share + gap, violation, free)
 
 
 def _decrement(pattern: HessianPattern, hessian: np.ndarray, dual: np.ndarray) -> float:
@@ -123,8 +127,8 @@ def _constrained(
     constraints: Constraints,
     entries: np.ndarray,
     pins: Pins,
-) -> float:
-    """The maximum over the steps that keep the linearized equalities, from their KKT system."""
+) -> tuple[float, np.ndarray]:
+    """The maximum over the steps that keep the linearized equalities, and its multipliers, from their KKT system."""
     import scipy.sparse as sp
     import scipy.sparse.linalg as spla
 
@@ -138,10 +142,11 @@ def _constrained(
     # rows that repeat or pinned away would make the system singular
     kkt = sp.csc_matrix(sp.block_array([[H, J.T], [J, -1e-14 * sp.eye_array(m)]]))
     try:
-        step = spla.splu(kkt).solve(np.concatenate([-dual, np.zeros(m)]))[:n]
+        found = spla.splu(kkt).solve(np.concatenate([-dual, np.zeros(m)]))
     except RuntimeError:
-        return float("nan")
-    return float(-dual @ step - step @ (H @ step) / 2)
+        return float("nan"), np.zeros(m)
+    step = found[:n]
+    return float(-dual @ step - step @ (H @ step) / 2), found[n:]
 
 
 def _joined(verdict: str, message: str) -> str:
