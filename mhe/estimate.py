@@ -1,4 +1,4 @@
-"""`Estimate`, what every estimator returns from a step, and `Estimator`, what it must offer."""
+"""`Estimate`, what every estimator returns from a step, `WindowEstimate`, its moving horizon form, and `Estimator`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from problems.solvers.base import Status
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from problems.solvers.session import Solution
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,38 @@ class Estimate:
             row |= {f"sigma_{name}": sigma for name, sigma in zip(self.state_names, sigmas, strict=True)}
         row |= {"status": str(self.status), "seconds": self.seconds}
         return pd.DataFrame([row], index=pd.Index([self.time], name="time"))
+
+
+class WindowEstimate(Estimate):
+    """An `Estimate` of a moving horizon estimator.
+
+    Attributes:
+        solution: of the window's problem: residuals, multipliers, objective, active set; None where nothing was solved.
+        parameters: (r,) estimated or given, or None.
+        too_late: times (s) of late measurements whose instant had already left the window; they were not used.
+    """
+
+    solution: Solution | None
+    parameters: np.ndarray | None
+    too_late: tuple[float, ...]
+
+    def __init__(self, fields: dict[str, Any]) -> None:
+        # the covariance is worked out on access, so the fields go in directly
+        self.__dict__.update(fields)
+
+    @property
+    def covariance(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """(n, n) of `state` by the window's own costs, bounds left out; None with pre-estimation, whose observer has no
+        noise model, and where the step found no solution.
+
+        Raises:
+            UnobservableError: the costs leave a direction free.
+        """
+        known = self.__dict__.get("_covariance")
+        if known is None and self.__dict__["_slot"] is not None:
+            assert self.solution is not None
+            known = self.__dict__["_covariance"] = self.solution.covariance(self.__dict__["_slot"])
+        return known
 
 
 @runtime_checkable
