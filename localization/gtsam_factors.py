@@ -12,6 +12,7 @@ import numpy as np
 from localization import measurements as meas
 from problems.forms.native_factors import register_native
 from problems.spaces import SE2, SO2, Vector
+from problems.spatial import SE3
 
 POINT2, POINT3 = Vector(2), Vector(3)
 
@@ -33,10 +34,15 @@ for _space in (Vector(1), POINT2, POINT3):
         meas.relative_position, (_space, _space), lambda i, j, z, noise: gtsam.BetweenFactorVector(i, j, z, noise)
     )
 
+register_native(meas.position, (SE3,), lambda i, z, noise: gtsam.GPSFactor(i, z, noise))
+
 register_native(meas.distance, (SE2, SE2), lambda i, j, z, noise: gtsam.RangeFactorPose2(i, j, z[0], noise))
 register_native(meas.distance, (SE2, POINT2), lambda i, j, z, noise: gtsam.RangeFactor2D(i, j, z[0], noise))
 register_native(meas.distance, (POINT2, SE2), lambda i, j, z, noise: gtsam.RangeFactor2D(j, i, z[0], noise))
 register_native(meas.distance, (POINT2, POINT2), lambda i, j, z, noise: gtsam.RangeFactor2(i, j, z[0], noise))
+register_native(meas.distance, (SE3, SE3), lambda i, j, z, noise: gtsam.RangeFactorPose3(i, j, z[0], noise))
+register_native(meas.distance, (SE3, POINT3), lambda i, j, z, noise: gtsam.RangeFactor3D(i, j, z[0], noise))
+register_native(meas.distance, (POINT3, SE3), lambda i, j, z, noise: gtsam.RangeFactor3D(j, i, z[0], noise))
 register_native(meas.distance, (POINT3, POINT3), lambda i, j, z, noise: gtsam.RangeFactor3(i, j, z[0], noise))
 
 register_native(

@@ -34,11 +34,8 @@ class Gaussian:
     """
 
     def __init__(self, sigma: Any = None, *, covariance: Any = None, information: Any = None) -> None:
-        given: list[tuple[Kind, Any]] = [
-            (k, v)
-            for k, v in (("sigma", sigma), ("covariance", covariance), ("information", information))
-            if v is not None
-        ]
+        stated: dict[Kind, Any] = {"sigma": sigma, "covariance": covariance, "information": information}
+        given: list[tuple[Kind, Any]] = [(kind, value) for kind, value in stated.items() if value is not None]
         if len(given) != 1:
             raise NoiseError(
                 f"Gaussian takes exactly one of sigma, covariance, information; got {[k for k, _ in given] or 'none'}"

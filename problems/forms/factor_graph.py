@@ -37,6 +37,7 @@ from problems.forms.template import template_of
 from problems.noise import L2
 from problems.problem import Problem
 from problems.spaces import SE2, SO2
+from problems.spatial import SE3, SO3
 
 Kind = Literal["native", "linear", "custom", "constraint", "pinned"]
 LINEAR_SLOTS = 3  # what gtsam's Python linear factors take
@@ -236,10 +237,10 @@ class FactorGraph:
     ) -> list[Any]:
         gtsam = gtsam_module()
         code = PointCode(template_of(entry.term))
-        reads = [reader(slot.source.space) for slot in entry.term.slots]
+        spaces = [slot.source.space for slot in entry.term.slots]
         shifts = np.zeros((len(keys), code.dim)) if shift is None else shift
         return [
-            gtsam.CustomFactor(noise, list(dict.fromkeys(k)), code.error(reads, k, row, s))
+            gtsam.CustomFactor(noise, list(dict.fromkeys(k)), code.error(spaces, k, row, s))
             for k, row, noise, s in zip(keys, numbers, noises, shifts, strict=True)
         ]
 
@@ -248,7 +249,13 @@ class FactorGraph:
         starts = self.layout.block_start
         name = max((start, name) for name, start in starts.items() if start <= block)[1]
         space = self.problem.unknowns[name].space
-        prior = {SE2: gtsam.PriorFactorPose2, SO2: gtsam.PriorFactorRot2}.get(space, gtsam.PriorFactorVector)
+        priors: dict[Any, Any] = {
+            SE2: gtsam.PriorFactorPose2,
+            SO2: gtsam.PriorFactorRot2,
+            SO3: gtsam.PriorFactorRot3,
+            SE3: gtsam.PriorFactorPose3,
+        }
+        prior = priors.get(space, gtsam.PriorFactorVector)
         value = to_gtsam(space)(self.layout.value(point, name)[block - starts[name]])
         return prior(self._block_keys[block], value, gtsam.noiseModel.Constrained.All(space.dim))
 

@@ -17,6 +17,7 @@ from problems.forms.template import Template, template_of
 from problems.noise import L2, Loss, whitening
 from problems.problem import DataSlot
 from problems.spaces import SE2, SO2, Space, Vector
+from problems.spatial import GTSAM_ORDER, SE3, SO3
 
 
 def gtsam_module() -> Any:
@@ -28,26 +29,45 @@ def gtsam_module() -> Any:
 
 
 def to_gtsam(space: Space) -> Callable[[np.ndarray], Any]:
-    if space == SE2:
-        return lambda row: gtsam_module().Pose2(row[0], row[1], row[2])
-    if space == SO2:
-        return lambda row: gtsam_module().Rot2(row[0])
+    """Makes gtsam's value of a row of stored coordinates. Raises FormError for a space gtsam does not have."""
     if isinstance(space, Vector):
         return lambda row: row
+    gtsam = gtsam_module()
+    if space == SE2:
+        return lambda row: gtsam.Pose2(row[0], row[1], row[2])
+    if space == SO2:
+        return lambda row: gtsam.Rot2(row[0])
+    if space == SO3:
+        return lambda row: gtsam.Rot3.Quaternion(row[3], row[0], row[1], row[2])
+    if space == SE3:
+        return lambda row: gtsam.Pose3(gtsam.Rot3.Quaternion(row[6], row[3], row[4], row[5]), row[:3])
     raise FormError(f"the space {space.name} has no counterpart among gtsam's values here; use solver='gauss-newton'")
 
 
 def reader(space: Space) -> Callable[[Any, int], Any]:
-    if space == SE2:
+    """Stored coordinates of a key in ``gtsam.Values``."""
+    readers: dict[Any, Callable[[Any, int], Any]] = {SE2: _pose2, SO2: _angle, SO3: _quaternion, SE3: _pose3}
+    return readers.get(space, lambda values, key: values.atVector(key))
 
-        def pose(values: Any, key: int) -> tuple[float, float, float]:
-            found = values.atPose2(key)
-            return found.x(), found.y(), found.theta()
 
-        return pose
-    if space == SO2:
-        return lambda values, key: (values.atRot2(key).theta(),)
-    return lambda values, key: values.atVector(key)
+def _pose2(values: Any, key: int) -> tuple[float, float, float]:
+    pose = values.atPose2(key)
+    return pose.x(), pose.y(), pose.theta()
+
+
+def _angle(values: Any, key: int) -> tuple[float]:
+    return (values.atRot2(key).theta(),)
+
+
+def _quaternion(values: Any, key: int) -> tuple[float, ...]:
+    q = values.atRot3(key).toQuaternion()
+    return q.x(), q.y(), q.z(), q.w()
+
+
+def _pose3(values: Any, key: int) -> tuple[float, ...]:
+    pose = values.atPose3(key)
+    q = pose.rotation().toQuaternion()
+    return (*pose.translation(), q.x(), q.y(), q.z(), q.w())
 
 
 class PointCode:
@@ -56,7 +76,9 @@ class PointCode:
     def __init__(self, template: Template) -> None:
         self.dim, self._dims = template.dim, template.dims
         outputs = ca.cse([template.residual, ca.densify(template.jacobian)])
-        buffer, self._run = ca.Function("factor", [template.point, template.numbers], outputs).buffer()
+        function = ca.Function("factor", [template.point, template.numbers], outputs)
+        buffer: Any
+        buffer, self._run = function.buffer()
         self._x, self._d = np.zeros(template.point.shape[0]), np.zeros(max(template.numbers.shape[0], 1))
         self._r, self._j = np.zeros(self.dim), np.zeros((template.width, self.dim))
         for i, array in enumerate((self._x, self._d)):
@@ -66,7 +88,7 @@ class PointCode:
         self._buffer = buffer
 
     def error(
-        self, reads: Sequence[Callable[..., Any]], keys: Sequence[int], numbers: np.ndarray, shift: np.ndarray
+        self, spaces: Sequence[Space], keys: Sequence[int], numbers: np.ndarray, shift: np.ndarray
     ) -> Callable[..., np.ndarray]:
         """Error function of the factor of one instance; an instance in two slots has one block."""
         places = list(dict.fromkeys(keys))
@@ -75,7 +97,8 @@ class PointCode:
             [slice(end - dim, end) for key, end, dim in zip(keys, ends, self._dims, strict=True) if key == place]
             for place in places
         ]
-        slots = list(zip(reads, keys, strict=True))
+        slots = [(reader(space), key) for space, key in zip(spaces, keys, strict=True)]
+        turned = [spaces[list(keys).index(place)] == SE3 for place in places]
 
         def error(_: Any, values: Any, jacobians: Any) -> np.ndarray:
             self._x[:] = np.concatenate([read(values, key) for read, key in slots])
@@ -86,7 +109,7 @@ class PointCode:
                     block = self._j[parts[0]]
                     for part in parts[1:]:
                         block = block + self._j[part]
-                    jacobians[k] = np.asfortranarray(block.T)
+                    jacobians[k] = np.asfortranarray(block[GTSAM_ORDER].T if turned[k] else block.T)
             return self._r + shift
 
         return error
@@ -191,7 +214,7 @@ def is_the_residual(native: NativeFactor, template: Template, spaces: tuple[Spac
         rows = [rng.normal(size=symbol.shape[0]) for symbol in template.data]
         jacobians: list[Any] = [None] * len(spaces)
         keys = list(range(len(spaces)))
-        error = code.error([reader(s) for s in spaces], keys, np.concatenate([*rows, []]), np.zeros(code.dim))
+        error = code.error(spaces, keys, np.concatenate([*rows, []]), np.zeros(code.dim))
         residual = error(None, values, jacobians)
         factor = native.build(*keys, *rows, gtsam.noiseModel.Unit.Create(template.dim))
         A, b = factor.linearize(values).jacobian()
