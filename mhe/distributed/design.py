@@ -206,7 +206,8 @@ class NetworkDesign:
         Args:
             updates: how many; fewer if the sequence settles before.
         """
-        if self._covariances is None or self._covariances[0] < updates:
+        known = self._covariances
+        if known is None or (known[1].settled is None and known[0] < updates):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ModelWarning)  # gamma was reported when the design was made
                 found = network_covariances(
@@ -221,8 +222,8 @@ class NetworkDesign:
                     rule=self.options.pi_update,
                     cap=self.cap,
                 )
-            self._covariances = updates, found
-        return self._covariances[1]
+            self._covariances = known = updates, found
+        return known[1]
 
     def convergence_rate(self) -> float:
         """Factor by which errors shrink per step in the long run, without noise and bounds (section 5 item 8)."""

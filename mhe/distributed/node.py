@@ -76,9 +76,12 @@ class DistributedNode:
             period=plan.period,
             forget_after=forget,
         )
-        self._mean, start = model.prior()
-        self._fused = start
-        self._settled = False
+        self._mean, self._start = model.prior()
+        self._fused = self._start
+        self._own_covariance = self._start
+        self._updated: np.ndarray | None = None  # the Pi_bar that Pi^i was computed from
+        self._covariances: list[Any] = []
+        self._entry = -1
         if plan.schedule is None:
             self._information = output_information(model.C, model.R)
             windows = [self._information] * options.horizon
@@ -90,7 +93,7 @@ class DistributedNode:
         self._u = np.zeros((slots, model.input_size))
         self._older = np.zeros((forget, model.input_size))  # inputs before the window, to propagate old estimates
         self._states = np.tile(self._mean, (slots, 1))
-        self._now: int | None = None
+        self._now = -1
         self._published: np.ndarray | None = None
         self._data: dict[str, Any] = {"y": self._flat} if model.measurement_size else {}
 
@@ -134,12 +137,12 @@ class DistributedNode:
         """
         started = perf_counter()
         current, late = self._hear(inbox)
-        newest, instant = self._newest, self._now
+        newest = self._newest
         missing = ()
         if np.isnan(self._y[newest]).any():
             missing = tuple(np.flatnonzero(np.isnan(self._y[newest])).tolist())
         status, infeasible = Status.SOLVED, ()
-        if instant == 0:
+        if self._now == 0:
             self._published = self._mean
         else:
             self._arrival(current)
@@ -183,8 +186,8 @@ class DistributedNode:
     def _advance(self, instant: int, u: np.ndarray) -> None:
         """Move the window on to `instant`."""
         N = self._horizon
-        first = self._now is None
-        before = instant if self._now is None else self._now
+        first = self._now < 0
+        before = instant if first else self._now
         for step in range(before + 1, instant + 1):
             if step > N:
                 self._y[:-1] = self._y[1:]
@@ -217,7 +220,7 @@ class DistributedNode:
             reading, full = self._schemas[message.sender]
             complete = message.schema == full.id
             values = (full if complete else reading).unpack(message)
-            slot = round(message.time / self._plan.period) - (self._now or 0) + self._newest
+            slot = round(message.time / self._plan.period) - self._now + self._newest
             if 0 <= slot <= self._newest:
                 self._y[slot, self._plan.member_rows[place]] = values["y"]
                 if slot < self._newest:
@@ -228,7 +231,6 @@ class DistributedNode:
             self._memory.receive(message.sender, message.time, values["state"], covariance)
             if message.time == self._time:
                 heard[message.sender] = values["state"], covariance
-        self._covariances: list[Any] | None = None
         if self._published is None or len(heard) < len(self._place) - 1:
             return None, tuple(late)
         heard[self._plan.index] = self._published, self._own_covariance
@@ -237,7 +239,7 @@ class DistributedNode:
 
     def _propagate(self, state: np.ndarray, age: int) -> np.ndarray:
         """A neighbour's published state of `age` steps ago, brought to the first instant of the present window."""
-        now, N = self._now or 0, self._horizon
+        now, N = self._now, self._horizon
         steps = max(0, now - N) - max(0, now - age - N)
         for k in range(steps, 0, -1):
             state = self._model.A @ state
@@ -249,84 +251,80 @@ class DistributedNode:
 
     # Arrival cost
 
-    _own_covariance: np.ndarray | None = None
-
     def _local(self) -> np.ndarray:
         """Pi^i of the state that is published now (3.3 steps 4 and 5); Pi_0 while the window grows."""
-        if (self._now or 0) > self._horizon:
+        if self._now <= self._horizon:
+            self._own_covariance = self._start
+        elif self._fused is not self._updated:
             model, rule = self._model, self._plan.options.pi_update
+            self._updated = self._fused
             self._own_covariance = arrival_update(
                 self._fused, model.A, model.process_covariance, self._information, self._windowed, rule
             )
-        else:
-            self._own_covariance = self._model.prior()[1]
         return self._own_covariance
 
     def _arrival(self, current: list[np.ndarray] | None) -> None:
         """Reference and information of the arrival cost."""
-        plan, instant = self._plan, self._now or 0
-        growing = instant <= self._horizon
+        plan, growing = self._plan, self._now <= self._horizon
         if current is not None:
             reference = plan.weights @ np.array(current)
-            fused = self._nominal(instant, growing)
+            fused = self._nominal(growing)
         else:
-            reference, fused = self._incomplete(instant, growing)
+            reference, fused = self._incomplete(growing)
         if growing and plan.options.growth_prior != "consensus":
-            own = plan.options.growth_prior == "own" and self._published is not None
-            reference = self._published if own else self._mean
-        self._data["reference"] = reference
+            own = self._published if plan.options.growth_prior == "own" else None
+            reference = self._mean if own is None else own
+        self._data["reference"] = np.reshape(reference, (1, -1))
         if fused is self._fused and self._passed is not None:
+            return
+        if self._passed is not None and _settled(self._fused, fused):
             return
         self._fused = fused
         information = inverse(fused)
-        passed = self._passed
-        if passed is None or np.abs(information - passed).max() > SETTLED_TOLERANCE * np.abs(information).max():
+        if self._passed is None or not _settled(self._passed, information):
             self._data["information"] = self._passed = information
 
-    def _nominal(self, instant: int, growing: bool) -> np.ndarray:
+    def _nominal(self, growing: bool) -> np.ndarray:
         """Pi_bar with all neighbours heard."""
         schedule = self._plan.schedule
         if schedule is not None:
-            entry = schedule.entry(instant)
+            entry = schedule.entry(self._now)
             if entry != self._entry:
-                self._entry, self._scheduled = entry, schedule.fused_at(instant)
+                self._entry, self._scheduled = entry, schedule.fused[entry]
             return self._scheduled
         if growing:
-            return self._model.prior()[1]
+            return self._start
         return self._combined(self._plan.coefficients, np.array(self._covariances))
-
-    _entry = -1
-    _scheduled: np.ndarray
 
     def _combined(self, coefficients: np.ndarray, covariances: np.ndarray) -> np.ndarray:
         fused = symmetrized(np.tensordot(coefficients, covariances, 1))
         return fused if self._plan.cap is None else capped(fused, self._plan.cap)
 
-    def _incomplete(self, instant: int, growing: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _incomplete(self, growing: bool) -> tuple[np.ndarray, np.ndarray]:
         """Reference and Pi_bar where neighbours are missing."""
         plan = self._plan
         try:
             recall = self._memory.recall(self._time)
         except DataError:
-            return self._alone(instant)
+            return self._alone()
         reference = recall.weights @ recall.states
         if growing:
-            return reference, self._model.prior()[1]
+            return reference, self._start
         covariances = recall.covariances
         places = [self._place[member] for member in recall.members]
         if plan.schedule is not None:
             aged = recall.ages[:, None, None] * self._model.process_covariance
-            covariances = plan.schedule.local_at(instant)[places] + aged
+            covariances = plan.schedule.local_at(self._now)[places] + aged
         assert covariances is not None
         share = plan.weights[places].sum()
         coefficients = plan.coefficients[places] / share**plan.power if share > 0 else recall.weights
         return reference, self._combined(coefficients, covariances)
 
-    def _alone(self, instant: int) -> tuple[np.ndarray, np.ndarray]:
+    def _alone(self) -> tuple[np.ndarray, np.ndarray]:
         """The prior of instant 0 propagated to the first instant of the window, where nothing was ever heard."""
         model = self._model
         reference, covariance = model.prior()
-        for _ in range(instant - self._horizon):
+        for _ in range(self._now - self._horizon):
             reference = model.A @ reference
             covariance = model.A @ covariance @ model.A.T + model.process_covariance
             if self._plan.cap is not None:
@@ -351,6 +349,10 @@ class DistributedNode:
         data = {name: store[name] for name, entry in inputs if entry.of is None}
         self._states, unmet = self._fallback(data, self._states, self._newest)
         return status, tuple(unmet)
+
+
+def _settled(before: np.ndarray, after: np.ndarray) -> bool:
+    return bool(np.abs(after - before).max() <= SETTLED_TOLERANCE * np.abs(after).max())
 
 
 def schemas(measurements: int, states: int, online: bool) -> tuple[Schema, Schema]:

@@ -26,10 +26,6 @@ class ArrivalSchedule:
     local: np.ndarray
     horizon: int
 
-    def fused_at(self, instant: int) -> np.ndarray:
-        """(n, n) Pi_bar used at step `instant`; the same object as long as it does not change."""
-        return self.fused[self.entry(instant)]
-
     def local_at(self, instant: int) -> np.ndarray:
         """(m, n, n) Pi^j behind it, for ``instant > N``."""
         return self.local[min(max(0, instant - self.horizon - 1), len(self.local) - 1)]

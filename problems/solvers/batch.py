@@ -195,7 +195,7 @@ class QPBatch(BatchSession):
             self._note_missing(name, self.numbers[:1, part])
         self._groups: list[Group] | None = None
         self._stacked: StackedMaps | None = None
-        self._forks: list[QPSession] = []
+        self._forks: list[Any] = []
         self._last: dict[int, Any] = {}
 
     def _set(self, name: str, value: Any) -> None:
