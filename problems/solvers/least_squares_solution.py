@@ -12,6 +12,7 @@ import scipy.sparse.linalg as spla
 from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.forms.selection import columns_of
+from problems.solvers.active import active_rows
 from problems.solvers.linear import covariance_blocks
 
 
@@ -57,8 +58,9 @@ class LeastSquaresCheck:
         if self._given is not None or not self._constraints.size:
             return np.zeros(0) if self._given is None else self._given
         values, J, lower, upper = self._rows
-        near = 1e-6 * np.maximum(1.0, np.abs(values))
-        active = np.flatnonzero((values >= upper - near) | (values <= lower + near))
+        held = active_rows(values, lower, upper, None)
+        held[: self._constraints.equalities] = 1
+        active = np.flatnonzero(held)
         y = np.zeros(values.size)
         if active.size:
             y[active] = spla.lsqr(J[active].T, -self._free_gradient, atol=1e-14, btol=1e-14)[0]
@@ -95,8 +97,7 @@ class LeastSquaresCheck:
         if not self._constraints.size:
             return {}
         values, _, lower, upper = self._rows
-        near = 1e-6 * np.maximum(1.0, np.abs(values))
-        state = np.where(values >= upper - near, 1, np.where(values <= lower + near, -1, 0))
+        state = active_rows(values, lower, upper, self._multipliers)
         kinds = {e.term.name: e.term.kind for e in self._constraints.terms}
         return {name: v for name, v in self._by_term(state).items() if kinds[name] == "inequality"}
 

@@ -17,6 +17,7 @@ from problems.forms.affine import Bounds, Matrix, Rows, block_diagonal, informat
 from problems.forms.layout import INFINITE, DataStore, constant_rows
 from problems.forms.quadratic import QuadraticProgram
 from problems.problem import DataSlot
+from problems.solvers.active import active_rows
 from problems.solvers.linear import covariance_blocks
 
 
@@ -102,7 +103,10 @@ class StackedRows:
 
     @cached_property
     def _solve_normal(self) -> Any:
-        return spla.factorized(sp.csc_matrix(self._equal_rows @ self._equal_rows.T))
+        normal = self._equal_rows @ self._equal_rows.T
+        # rows that repeat or are empty share their multiplier instead of making the system singular
+        ridge = 1e-14 * max(float(normal.diagonal().max(initial=0.0)), 1e-300)
+        return spla.factorized(sp.csc_matrix(normal + ridge * sp.eye_array(normal.shape[0])))
 
     def equality_multipliers(self, gradient: np.ndarray) -> np.ndarray:
         """Least-squares multipliers: what remains of the stationarity condition is its residual."""
@@ -139,12 +143,9 @@ class StackedRows:
         lower = np.where(self._off | (lower <= -INFINITE), -np.inf, lower)
         return lower, np.where(self._off | (upper >= INFINITE), np.inf, upper)
 
-    def active(self, values: np.ndarray, d: np.ndarray) -> np.ndarray:
+    def active(self, values: np.ndarray, d: np.ndarray, mu: np.ndarray | None) -> np.ndarray:
         """1 at the upper bound, -1 at the lower, 0 between."""
-        lower, upper = self.bounds(d)
-        r = values[self._bounded]
-        near = 1e-7 * np.maximum(1.0, np.abs(r))
-        return np.where(r >= upper - near, 1, np.where(r <= lower + near, -1, 0))
+        return active_rows(values[self._bounded], *self.bounds(d), mu)
 
     def covariance(self, columns: np.ndarray) -> np.ndarray:
         """Rows and columns `columns` of the covariance; it depends on no vector data, so it is kept."""

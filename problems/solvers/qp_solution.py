@@ -77,7 +77,7 @@ class QPCheck:
 
     def active_set(self) -> dict[str, np.ndarray]:
         rows = self._rows
-        active = rows.active(self._values, self._numbers)
+        active = rows.active(self._values, self._numbers, self._mu)
         return {name: active[part].reshape(shape) for name, part, shape in rows.inequalities}
 
     def covariance(self, slots: tuple[Any, ...]) -> np.ndarray:
