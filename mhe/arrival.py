@@ -55,7 +55,7 @@ class WindowState:
 
     def values(self) -> dict[str, Any]:
         """Values of the window's variables to linearize at."""
-        values = {"x": self.states}
+        values: dict[str, Any] = {"x": self.states}
         if "parameters" in self.session.problem.unknowns:
             values["parameters"] = self.parameters
         return values

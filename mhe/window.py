@@ -88,7 +88,7 @@ class Window:
             raise SettingError("the model has no parameters to estimate")
         self.model, self.horizon = model, int(horizon)
         self.gain = None if gain is None else _gain(gain, model)
-        self.form = self._statement(form)
+        self.form: WindowForm | None = self._statement(form)
         self.penalty = penalty
         self.problem = Problem(f"window of {self.horizon} transitions")
         N, n, m, r = self.horizon, model.state_size, model.input_size, model.parameter_size
@@ -116,6 +116,7 @@ class Window:
         if state_bounds is not None:
             self._bound("state", state_bounds, n)
         if disturbance_bounds is not None:
+            disturbance_bounds.warn_without_origin("disturbance bounds")
             self._bound("disturbance", disturbance_bounds, n if gain is not None else model.disturbance_size)
 
     def compile(self, solver: str = "auto", **settings: Any) -> Session:
@@ -284,6 +285,7 @@ class Window:
         """L (y - h(x)) with the components that are there; `y` holds measurements, then presence flags."""
         size = self.model.measurement_size
         innovation = self.model.residual(y[:size], _predicted(self.model, x, u, p))
+        assert self.gain is not None
         return ca.DM(self.gain) @ (y[size:] * innovation)
 
     def _transitions(self) -> None:
