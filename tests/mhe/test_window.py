@@ -159,7 +159,8 @@ def test_forms_and_solvers_agree_with_active_rows(solver, tolerance, agreement, 
         active += expected.solved and bool(expected.active_set["state bounds"].any())
         for session in sessions:
             solution = session.solve(data)
-            assert solution.status == expected.status
+            # a first-order solver may miss its own tolerance, but must say so and still agree
+            assert solution.status == expected.status or (solver == "osqp" and solution.status == "inaccurate")
             if expected.solved:
                 np.testing.assert_allclose(solution["x"], expected["x"], atol=agreement)
     assert active >= 4
