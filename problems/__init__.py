@@ -4,6 +4,7 @@ from problems.errors import HorizonetError
 from problems.models import LinearModel, NonlinearModel, Sensor, simulate
 from problems.noise import L2, Cauchy, Gaussian, GemanMcClure, Huber, Tukey
 from problems.problem import Problem
+from problems.soft import Soft
 from problems.spaces import SE2, SO2, Pose2, Rotation2, Vector, wrap
 from problems.spatial import SE3, SO3, Pose3, Rotation3
 
@@ -26,6 +27,7 @@ __all__ = [
     "Rotation2",
     "Rotation3",
     "Sensor",
+    "Soft",
     "Tukey",
     "Vector",
     "simulate",

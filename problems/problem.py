@@ -19,6 +19,7 @@ from problems.noise import L2, Gaussian, Loss
 from problems.spaces import Space
 
 if TYPE_CHECKING:
+    from problems.soft import Soft
     from problems.solvers.session import Session
 
 Index = int | slice | Sequence[int] | np.ndarray
@@ -263,19 +264,29 @@ class Problem:
         lower: Numbers = -np.inf,
         upper: Numbers = 0.0,
         active: Numbers = None,
+        soft: Soft | None = None,
     ) -> Term:
         """Require ``lower <= r <= upper`` of every instance.
 
         Args:
             lower, upper: a number, (dim,), (count, dim), or data; infinite where there is no bound.
+            soft: price at which the bounds may be violated; they are hard without. The violations are the variables
+                ``"<name> slack"`` (dim each), and the problem gets terms whose names begin with `name`.
 
         Other arguments and errors as for `cost`.
+
+        Returns:
+            The term; of soft bounds, the one of the first side that has a bound.
 
         Raises:
             EmptyConstraintError: constant bounds that cross.
         """
         term = self._term("inequality", name, residual, on, data, lower=lower, upper=upper, active=active)
-        return self._add(term)
+        if soft is None:
+            return self._add(term)
+        from problems.soft import relaxed
+
+        return relaxed(self, term, soft)
 
     def compile(
         self, solver: str = "auto", form: str | None = None, eliminate: Sequence[Any] = (), **settings: Any

@@ -100,7 +100,7 @@ def _template(residual: Callable[..., Any], spaces: tuple[Space, ...], shapes: t
     deltas = tuple(ca.SX.sym(f"delta{i}", space.dim) for i, space in enumerate(spaces))
     elements = [_displaced(space, xi, di) for space, xi, di in zip(spaces, x, deltas, strict=True)]
     rows = [_shaped(di, shape) for di, shape in zip(d, shapes, strict=True)]
-    moved = _column(_call(residual, elements, rows))
+    moved = as_column(_call(residual, elements, rows))
     allowed = [*x, *d, *deltas]
     free = [s.name() for s in ca.symvar(moved) if not any(ca.depends_on(a, s) for a in allowed)]
     if free:
@@ -154,7 +154,7 @@ def _call(residual: Callable[..., Any], elements: list[Any], rows: list[ca.SX]) 
         ) from error
 
 
-def _column(value: Any) -> ca.SX:
+def as_column(value: Any) -> ca.SX:
     if isinstance(value, (list, tuple)):
         try:
             value = ca.vertcat(*value)
