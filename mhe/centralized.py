@@ -212,6 +212,8 @@ class MovingHorizonEstimator:
         if ready is None:
             if amendments and not first and self._arrival.takes_leaving:
                 amendments = slots.amend(amendments, used)
+                # the arrival cost is made from what the session knows
+                self.session.update(y=slots.column)
             self._advance(u)
         slots.enter(y, instant)
         if amendments:
