@@ -32,9 +32,12 @@ Fence = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations: `position` (GPS, m per axis), `heading` (compass, rad), `range` (m), `bearing` (rad)."""
+    """Standard deviations: `position` (GPS, m per axis), `heading` (compass, rad), `range` (m), `bearing` (rad).
 
-    position: float = 2.0
+    That of GPS may be one per robot and axis, (n, 2).
+    """
+
+    position: float | np.ndarray = 2.0
     heading: float = 0.05
     range: float = 0.1
     bearing: float = 0.03

@@ -110,7 +110,7 @@ def _write(path: Path, recording: Any, made: Any) -> None:
     covariance = None
     if made.covariance is not None:
         covariance = np.full((count, 3, 3), np.nan)
-        covariance[:, :2, :2] = made.covariance[:, :2, :2]
+        covariance[:, :2, :2] = made.covariance
     stamps = recording.start * 1e-9 + made.estimate.time
     poses = Poses(stamps, np.full(count, "tag"), made.estimate.value, np.full((count, 1), np.nan), covariance)
     try:

@@ -237,6 +237,16 @@ class RangeTracker:
         """(4, 4) of the reported state."""
         return self.solution.covariance(self._state[self._row])
 
+    def advanced(self, state: np.ndarray) -> np.ndarray:
+        """Position (2,) of a state when the ranging latency has passed."""
+        return state[:2] + self.settings.lag * state[2:]
+
+    def advanced_covariance(self) -> np.ndarray:
+        """(2, 2) of the reported position when the ranging latency has passed, m^2."""
+        s = self.settings
+        ahead = np.hstack([np.eye(2), s.lag * np.eye(2)])
+        return ahead @ self.covariance() @ ahead.T + s.acceleration * s.lag**3 / 3 * np.eye(2)
+
     def _slide(self) -> None:
         """Integrate the oldest knot out and move everything one knot forward."""
         left = self.session.marginal(self._state[0], keep=[self._state[1], self._bias])
@@ -270,7 +280,8 @@ class Track:
 
     Attributes:
         estimate: (time, position (m, 2)) of each knot, advanced by the lag.
-        velocity: (m, 2) m/s. covariance: (m, 4, 4) or None.
+        velocity: (m, 2) m/s.
+        covariance: (m, 2, 2) of the positions, m^2, or None.
         bias: (k,) last biases, m.
         step_seconds: (m,) computing time of each knot.
         compile_seconds: of the session. status: solves by status. iterations: in total.
@@ -374,15 +385,17 @@ def track(
     compile_seconds = time.perf_counter() - begin
     knots, steps = arrivals(recording, s, fixes)
     count = len(knots)
-    states, seconds, iterations = np.empty((count, 4)), np.empty(count), 0
-    P = np.empty((count, 4, 4)) if covariances else None
+    states, position = np.empty((count, 4)), np.empty((count, 2))
+    seconds, iterations = np.empty(count), 0
+    P = np.empty((count, 2, 2)) if covariances else None
     for j in range(count):
         begin = time.perf_counter()
         states[j] = tracker.step(*steps[j])
         seconds[j] = time.perf_counter() - begin
+        position[j] = tracker.advanced(states[j])
         iterations += tracker.solution.iterations
         if P is not None:
-            P[j] = tracker.covariance()
+            P[j] = tracker.advanced_covariance()
         if progress is not None:
             progress(j + 1, count)
     if tracker.dropped:
@@ -392,7 +405,6 @@ def track(
             ModelWarning,
             stacklevel=2,
         )
-    position = states[:, :2] + s.lag * states[:, 2:]
     keep = slice(round(s.delay / s.period), None)  # before, the reported knot stood still
     return Track(
         TimeSeries(knots[keep] - s.delay, position[keep]),
