@@ -13,10 +13,12 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from problems.errors import EmptyConstraintError, FormError
 
 Matrix = Any
+SINGULAR = 1e12  # condition number from which equalities do not determine unknowns
 
 
 @dataclass(eq=False)
@@ -45,27 +47,32 @@ def defining_rows(R: Matrix, columns: np.ndarray) -> np.ndarray:
 
 
 def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: str) -> tuple[AffineMap, np.ndarray]:
-    """Solve the unknowns in `columns` from the equalities ``R z + E d + c = 0`` that contain them.
+    """Solve the unknowns in `columns` from equalities ``R z + E d + c = 0`` that contain them.
+
+    Where more rows contain them than there are unknowns, rows that determine them are chosen; the others stay, with the
+    unknowns replaced.
 
     Returns:
         The map, whose v are the other unknowns in their order, and the rows that were used up.
 
     Raises:
-        FormError: the equalities containing them are not square in them, or singular.
+        FormError: the equalities containing them are fewer than the unknowns, or do not determine them.
     """
     used = defining_rows(R, columns)
     size = R.shape[1]
     kept = np.setdiff1d(np.arange(size), columns)
-    if used.size != columns.size:
+    if used.size < columns.size:
         raise FormError(
-            f"cannot eliminate {names}: {columns.size} unknowns appear in {used.size} equality rows; the equalities "
-            "must define them one to one"
+            f"cannot eliminate {names}: {columns.size} unknowns appear in {used.size} equality rows, too few to define "
+            "them"
         )
+    if used.size > columns.size:
+        used = used[_determining(R[used][:, columns], names)]
     dense = isinstance(R, np.ndarray)
     block = R[used][:, columns]
     right = [R[used][:, kept], E[used], c[used][:, None]]
     if dense:
-        if np.linalg.cond(block) > 1e12:
+        if not _condition(block) < SINGULAR:
             raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)")
         solved = [-np.linalg.solve(block, b) for b in right]
         Z, Y = np.zeros((size, kept.size)), np.zeros((size, E.shape[1]))
@@ -76,6 +83,9 @@ def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: s
             factor = spla.splu(sp.csc_matrix(block))
         except RuntimeError as error:
             raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)") from error
+        inverse = spla.LinearOperator(block.shape, factor.solve, lambda v: factor.solve(v, "T"))
+        if not spla.onenormest(inverse) * spla.norm(block, 1) < SINGULAR:
+            raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)")
         solved = [-factor.solve(b.toarray() if sp.issparse(b) else b) for b in right]
         place = sp.csr_array((np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size))
         stay = sp.csr_array((np.ones(kept.size), (kept, np.arange(kept.size))), shape=(size, kept.size))
@@ -84,6 +94,28 @@ def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: s
     z0 = np.zeros(size)
     z0[columns] = np.asarray(solved[2]).ravel()
     return AffineMap(Z, Y, z0), used
+
+
+def _condition(block: np.ndarray) -> float:
+    """Condition number, whatever the units of rows and columns."""
+    rows = np.abs(block).max(axis=1, keepdims=True)
+    scaled = block / np.where(rows > 0, rows, 1.0)
+    columns = np.abs(scaled).max(axis=0)
+    return float(np.linalg.cond(scaled / np.where(columns > 0, columns, 1.0)))
+
+
+def _determining(block: Matrix, names: str) -> np.ndarray:
+    """As many rows of `block` as it has columns, chosen so that they determine the columns."""
+    wide = block.shape[1]
+    if isinstance(block, np.ndarray):
+        return np.sort(la.qr(block.T, mode="r", pivoting=True)[1][:wide])
+    # the matching with the largest product of entries
+    cost = sp.csr_array(block)
+    cost.data = 1.0 + np.log(np.abs(cost.data).max()) - np.log(np.abs(cost.data))
+    try:
+        return np.sort(min_weight_full_bipartite_matching(cost)[0])
+    except ValueError as error:
+        raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)") from error
 
 
 def null_space(R: np.ndarray, E: np.ndarray, c: np.ndarray) -> AffineMap:
