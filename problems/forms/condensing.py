@@ -127,8 +127,11 @@ def null_space(R: np.ndarray, E: np.ndarray, c: np.ndarray) -> AffineMap:
     size = R.shape[1]
     if not R.shape[0]:
         return AffineMap.identity(size, E.shape[1], True)
+    units = np.linalg.norm(R, axis=1)
+    units[units == 0] = 1.0
+    R, E, c = R / units[:, None], E / units[:, None], c / units
     U, s, Vt = la.svd(R)
-    rank = int((s > 1e-11 * s[0]).sum())
+    rank = int((s > 1e-11).sum())
     null = U[:, rank:]
     if np.abs(null.T @ np.column_stack([E, c])).max(initial=0.0) > 1e-9:
         if np.abs(null.T @ E).max(initial=0.0) <= 1e-9:

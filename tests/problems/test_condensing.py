@@ -133,7 +133,8 @@ def test_maps_compose() -> None:
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
 def test_null_space_is_orthonormal_at_every_scale(scale: float) -> None:
     R, E, c = rows(5, 3, 7, 2)
-    map_ = null_space(scale * R, scale * E, scale * c)
+    units = np.array([scale, 1.0, scale])
+    map_ = null_space(units[:, None] * R, units[:, None] * E, units * c)
     assert map_.Z.shape == (7, 4)
     np.testing.assert_allclose(map_.Z.T @ map_.Z, np.eye(4), atol=1e-12)
     check_map(map_, R, E, c)
