@@ -207,7 +207,7 @@ class _Search:
                         raise SingularError("no finite step")
             except SingularError as error:
                 if self.damping == 0 and not session.constraints.size:
-                    free = self._free(hessian)
+                    free = self.layout.names_of((hessian[self.diagonal] <= 0).astype(float))
                     if free:
                         return Status.UNBOUNDED, f"the costs leave {free} free ({error})"
                 if not self._harder():
@@ -275,14 +275,3 @@ class _Search:
             return np.zeros(0)
         values = constraints.residual(point, self.numbers, self.bound.flags)
         return np.maximum(np.maximum(values - self.upper, self.lower - values), 0.0)
-
-    def _free(self, hessian: np.ndarray) -> str:
-        names = []
-        diagonal = hessian[self.diagonal]
-        for name, variable in self.session.problem.unknowns.items():
-            start = self.layout.start[name]
-            part = diagonal[start : start + variable.count * variable.space.dim].reshape(variable.count, -1)
-            rows = np.flatnonzero((part <= 0).any(axis=1))
-            if rows.size:
-                names.append(f"{name}[{rows[0]}]" + (f" and {rows.size - 1} more" if rows.size > 1 else ""))
-        return ", ".join(names)

@@ -28,8 +28,13 @@ class SingularError(ArithmeticError):
 
 
 class Factorization(Protocol):
-    def factor(self, values: np.ndarray) -> None: ...
-    def solve(self, right: np.ndarray) -> np.ndarray: ...
+    def factor(self, values: np.ndarray) -> None:
+        """Take the entries of the upper triangle; raises SingularError."""
+        ...
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """Solution for one right side (n,) or several (n, k)."""
+        ...
 
 
 class DenseCholesky:
@@ -47,6 +52,8 @@ class DenseCholesky:
         self._factor, info = dpotrf(self._matrix.T, lower=0)
         if info != 0:
             raise SingularError(f"leading minor {info} is not positive")
+        if np.isnan(self._factor.diagonal()).any():
+            raise SingularError("the matrix is not finite")
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         return dpotrs(self._factor, right, lower=0)[0]
@@ -58,6 +65,7 @@ class SparseLDL:
     def __init__(self, pattern: HessianPattern) -> None:
         shape = (pattern.size, pattern.size)
         self._matrix = sp.csc_matrix((np.ones(pattern.nonzeros), pattern.indices, pattern.indptr), shape=shape)
+        self._diagonal = pattern.diagonal
         self._solver: Any = None
 
     def factor(self, values: np.ndarray) -> None:
@@ -66,6 +74,8 @@ class SparseLDL:
         self._matrix.data = values
         if not np.isfinite(values).all():
             raise SingularError("the matrix is not finite")
+        if (values[self._diagonal] <= 0).any():
+            raise SingularError("a diagonal entry is not positive")
         try:
             if self._solver is None:
                 self._solver = qdldl.Solver(self._matrix, upper=True)
