@@ -35,7 +35,7 @@ from problems.forms.native_factors import NativeFactor, native_factor
 from problems.forms.pins import Pins
 from problems.forms.template import template_of
 from problems.noise import L2
-from problems.problem import Problem
+from problems.problem import Problem, Term
 from problems.spaces import SE2, SO2
 from problems.spatial import SE3, SO3
 
@@ -173,7 +173,7 @@ class FactorGraph:
     def _lowered(self, entry: TermLayout) -> GraphTerm:
         term = entry.term
         if term.kind == "equality":
-            return GraphTerm(term.name, "pinned" if term.name in self.pins.names else "constraint", term.count)
+            return self._lowered_equality(term)
         spaces = tuple(slot.source.space for slot in term.slots)
         repeated = bool((np.diff(np.sort(entry.blocks, axis=1), axis=1) == 0).any())
         native = native_factor(term.residual, spaces)
@@ -191,15 +191,17 @@ class FactorGraph:
         else:
             self._native[term.name] = native
             return GraphTerm(term.name, "native", term.count)
-        if template.affine and isinstance(term.loss, L2) and len(spaces) <= LINEAR_SLOTS:
+        if _is_linear(term) and isinstance(term.loss, L2):
             return GraphTerm(term.name, "linear", term.count, reason)
-        warnings.warn(
-            f"{term.what}: {reason}; its {term.count} instance(s) become Python factors, some 50 times slower. "
-            "problems.forms.native_factors.register_native names a native one",
-            SlowPathWarning,
-            stacklevel=4,
-        )
+        _warn_slow(term, f"{reason}; problems.forms.native_factors.register_native names one")
         return GraphTerm(term.name, "custom", term.count, reason)
+
+    def _lowered_equality(self, term: Term) -> GraphTerm:
+        if term.name in self.pins.names:
+            return GraphTerm(term.name, "pinned", term.count)
+        if not _is_linear(term):
+            _warn_slow(term, f"it is not affine in at most {LINEAR_SLOTS} variables")
+        return GraphTerm(term.name, "constraint", term.count)
 
     def _linear(
         self,
@@ -222,7 +224,7 @@ class FactorGraph:
     def _constraints(self, entry: TermLayout, keys: Sequence[Sequence[int]], numbers: np.ndarray) -> list[Any]:
         template = template_of(entry.term)
         exact = gtsam_module().noiseModel.Constrained.All(template.dim)
-        if template.affine and len(template.dims) <= LINEAR_SLOTS:
+        if _is_linear(entry.term):
             residual, jacobian = at_zero(entry, numbers)
             return linear_factors(entry, keys, jacobian, residual, exact)
         return self._custom(entry, keys, numbers, [exact] * len(keys), None)
@@ -258,6 +260,18 @@ class FactorGraph:
         prior = priors.get(space, gtsam.PriorFactorVector)
         value = to_gtsam(space)(self.layout.value(point, name)[block - starts[name]])
         return prior(self._block_keys[block], value, gtsam.noiseModel.Constrained.All(space.dim))
+
+
+def _is_linear(term: Term) -> bool:
+    return template_of(term).affine and len(term.slots) <= LINEAR_SLOTS
+
+
+def _warn_slow(term: Term, reason: str) -> None:
+    warnings.warn(
+        f"{term.what}: its {term.count} instance(s) become Python factors, some 50 times slower: {reason}",
+        SlowPathWarning,
+        stacklevel=5,
+    )
 
 
 def _require_graph(problem: Problem) -> None:

@@ -25,6 +25,7 @@ from problems.solvers.qp_support import checked_settings, native
 from problems.solvers.session import Session, Solution
 
 ITERATIONS = 100
+STALL = 1e-3  # of the tolerance: relative change of the cost at which the iteration ends
 LinearSolver = Literal["MULTIFRONTAL_CHOLESKY", "MULTIFRONTAL_QR", "SEQUENTIAL_CHOLESKY", "SEQUENTIAL_QR"]
 Ordering = Literal["COLAMD", "METIS", "NATURAL"]
 
@@ -119,6 +120,9 @@ class GtsamSession(Session):
         import gtsam
 
         parameters = getattr(gtsam, f"{self.optimizer}Params")()
+        # Levenberg-Marquardt gives up a search for damping below the relative one
+        parameters.setRelativeErrorTol(STALL * self.options.tolerance)
+        parameters.setAbsoluteErrorTol(STALL * self.options.tolerance)
         for name, value in native(settings).items():
             setter = getattr(parameters, f"set{name}", None) or getattr(parameters, f"set{name[0].upper()}{name[1:]}")
             setter(value)
@@ -200,7 +204,7 @@ class GtsamSession(Session):
                 new, found = optimizer.error(), optimizer.values()
                 if not np.isfinite(new):
                     return Status.FAILED, "the cost became infinite", iterations, None
-                if abs(cost - new) <= 1e-3 * self.options.tolerance * max(1.0, new):
+                if abs(cost - new) <= STALL * self.options.tolerance * max(1.0, new):
                     return Status.SOLVED, "", iterations, found
                 cost = new
                 if time.perf_counter() > deadline:

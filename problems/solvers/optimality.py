@@ -142,11 +142,15 @@ def _constrained(
     # rows that repeat or pinned away would make the system singular
     kkt = sp.csc_matrix(sp.block_array([[H, J.T], [J, -1e-14 * sp.eye_array(m)]]))
     try:
-        found = spla.splu(kkt).solve(np.concatenate([-dual, np.zeros(m)]))
+        factor = spla.splu(kkt)
     except RuntimeError:
         return float("nan"), np.zeros(m)
+    multipliers = factor.solve(np.concatenate([-dual, np.zeros(m)]))[n:]
+    # again from what the multipliers leave: large ones would drown a small decrement in rounding
+    rest = dual + J.T @ multipliers
+    found = factor.solve(np.concatenate([-rest, np.zeros(m)]))
     step = found[:n]
-    return float(-dual @ step - step @ (H @ step) / 2), found[n:]
+    return float(-rest @ step - step @ (H @ step) / 2), multipliers + found[n:]
 
 
 def _joined(verdict: str, message: str) -> str:
