@@ -6,7 +6,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
@@ -68,12 +68,13 @@ class Settings(pydantic.BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """One trial: what the team measured, and the optimum of each method's problem."""
+    """One trial: what the team measured, the problem of each method, and its optimum."""
 
     team: Measurements
     loss: Loss | None
     fence: Fence | None
     outliers: np.ndarray
+    _optima: dict[str, np.ndarray] = field(default_factory=dict)  # found when they are first asked for
 
     def problem(self, method: str) -> tuple[Problem, dict[str, np.ndarray]]:
         """The problem a method solves, and its data."""
@@ -86,15 +87,14 @@ class Drawn:
         """Poses (n, 3): least squares without fence and loss, and compass."""
         return linear_start(self.team)[0]
 
-    @cached_property
-    def optimum(self) -> dict[str, np.ndarray]:
-        """Positions (n, 2) of the optimum by method, solved much more tightly than anything it is compared with."""
-        found = {}
-        for method, initial in (("ml", self.start), ("ls", self.start[:, :2])):
+    def optimum(self, method: str) -> np.ndarray:
+        """Positions (n, 2) of the optimum, solved much more tightly than anything it is compared with."""
+        if method not in self._optima:
             problem, data = self.problem(method)
+            initial = self.start if method == "ml" else self.start[:, :2]
             session = problem.compile("gauss-newton", tolerance=REFERENCE_TOLERANCE)
-            found[method] = session.solve(data, initial={"robot": initial})["robot"][:, :2].copy()
-        return found
+            self._optima[method] = session.solve(data, initial={"robot": initial})["robot"][:, :2].copy()
+        return self._optima[method]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +171,7 @@ class DemoTeamScenario:
 def _metrics(drawn: Drawn, method: str, robot: np.ndarray) -> dict[str, float | None]:
     truth = drawn.team.truth
     assert truth is not None
-    away = np.linalg.norm(robot[:, :2] - drawn.optimum[method], axis=1)
+    away = np.linalg.norm(robot[:, :2] - drawn.optimum(method), axis=1)
     headings = float(np.sqrt(np.mean(wrap(robot[:, 2] - truth[:, 2]) ** 2))) if robot.shape[1] == 3 else None
     return {
         "rmse": sum(split_squared_error(robot, truth)) ** 0.5,
