@@ -81,6 +81,8 @@ class DistributedNode:
         self._own_covariance = self._start
         self._updated: np.ndarray | None = None  # the Pi_bar that Pi^i was computed from
         self._covariances: list[Any] = []
+        self._considered: np.ndarray | None = None  # the newest Pi_bar; `_fused` stays until it differs noticeably
+        self._heard = b""
         self._entry = -1
         if plan.schedule is None:
             self._information = output_information(model.C, model.R)
@@ -275,8 +277,9 @@ class DistributedNode:
             own = self._published if plan.options.growth_prior == "own" else None
             reference = self._mean if own is None else own
         self._data["reference"] = np.reshape(reference, (1, -1))
-        if fused is self._fused and self._passed is not None:
+        if fused is self._considered:
             return
+        self._considered = fused
         if self._passed is not None and _settled(self._fused, fused):
             return
         self._fused = fused
@@ -294,7 +297,11 @@ class DistributedNode:
             return self._scheduled
         if growing:
             return self._start
-        return self._combined(self._plan.coefficients, np.array(self._covariances))
+        heard = b"".join([covariance.tobytes() for covariance in self._covariances])
+        if heard != self._heard:
+            self._heard = heard
+            self._latest = self._combined(self._plan.coefficients, np.array(self._covariances))
+        return self._latest
 
     def _combined(self, coefficients: np.ndarray, covariances: np.ndarray) -> np.ndarray:
         fused = symmetrized(np.tensordot(coefficients, covariances, 1))
