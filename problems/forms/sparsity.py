@@ -7,6 +7,7 @@ variable instances; an assembly is one weighted count per term.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -44,12 +45,28 @@ class HessianPattern:
         self.indptr = np.concatenate([[0], np.cumsum(length)]).astype(np.intp)
         self.diagonal = self.indptr[1:] - 1
         self._unique, self._above, self._blocks, self._start = unique, above, blocks, start
+        self._graph = (row, col, dims)
         self.indices = self._row_indices(col, row, dims)
         self.positions = [self._positions(entry, pairs) for entry, pairs in terms]
 
     @property
     def nonzeros(self) -> int:
         return int(self.indptr[-1])
+
+    @cached_property
+    def work(self) -> float:
+        """Operations of a factorization in an approximate minimum degree order of the variable instances."""
+        import qdldl
+        import scipy.sparse as sp
+
+        row, col, dims = self._graph
+        degree = np.bincount(np.concatenate([row, col]), minlength=self._blocks) + 1.0
+        values = np.where(row == col, degree[col], -1.0)
+        graph = sp.csc_matrix((values, (row, col)), shape=(self._blocks, self._blocks))
+        L, _, order = qdldl.Solver(graph, upper=True).factors()
+        size = dims[order].astype(float)
+        rows = size + np.bincount(np.repeat(np.arange(self._blocks), np.diff(L.indptr)), size[L.indices], self._blocks)
+        return float((size * rows**2).sum())
 
     def _row_indices(self, col: np.ndarray, row: np.ndarray, dims: np.ndarray) -> np.ndarray:
         indices = np.empty(self.nonzeros, np.intp)

@@ -20,8 +20,8 @@ from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.problem import Problem
 from problems.solvers.base import Options, Status
+from problems.solvers.factorizations import LinearSolver, SingularError, factorization
 from problems.solvers.least_squares_solution import LeastSquaresCheck
-from problems.solvers.linear import SingularError, factorization
 from problems.solvers.optimality import optimality
 from problems.solvers.qp_step import QPStep
 from problems.solvers.qp_support import checked_settings
@@ -42,12 +42,15 @@ class Settings:
         iterations: exact number of steps without convergence test (real-time iteration); None iterates to convergence.
         screen: answer steps that satisfy the linearized constraints by the linear solve; else the QP backend is always
             called.
+        linear_solver: factorization of the normal equations: ``dense``, ``qdldl``, ``superlu``, ``pardiso`` (extra
+            ``pardiso``), ``cholmod`` (extra ``gpl``), or ``auto``: by size, work and what is installed.
     """
 
     qp_solver: str | None = None
     whole: bool | None = None
     iterations: int | None = None
     screen: bool = True
+    linear_solver: LinearSolver = "auto"
 
 
 class GaussNewton(Session):
@@ -69,7 +72,7 @@ class GaussNewton(Session):
         self.constraints = Constraints(layout, self.pins.names)
         pattern = self.form_.pattern
         self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-        self._linear = factorization(pattern)
+        self._linear = factorization(pattern, self.settings.linear_solver)
         self._renew()
 
     @classmethod
@@ -81,7 +84,7 @@ class GaussNewton(Session):
         return own_version()
 
     def _forked(self) -> None:
-        self._linear = factorization(self.form_.pattern)
+        self._linear = factorization(self.form_.pattern, self.settings.linear_solver)
         self._renew()
 
     def reset(self) -> None:

@@ -20,7 +20,7 @@ from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.forms.sparsity import HessianPattern
 from problems.solvers.base import Options, Status
-from problems.solvers.linear import SingularError, factorization
+from problems.solvers.factorizations import SingularError, factorization
 
 RIDGE = 1e-12  # of the largest diagonal entry, added so that directions the costs leave free have finite steps
 

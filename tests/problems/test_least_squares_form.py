@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 import casadi as ca
@@ -14,7 +15,8 @@ from problems.errors import DataError, UnobservableError
 from problems.forms.layout import DataStore, Layout
 from problems.forms.least_squares import WHOLE_LIMIT, Constraints, LeastSquares
 from problems.forms.pins import Pins
-from problems.solvers.linear import DenseCholesky, SingularError, SparseLDL, covariance_blocks, factorized_kkt
+from problems.solvers.factorizations import CLASSES, SingularError
+from problems.solvers.linear import covariance_blocks, factorized_kkt
 
 ROBOTS, POINTS = 5, 4
 
@@ -333,7 +335,12 @@ def pattern_and_matrix(seed: int, shift: float) -> tuple[Any, np.ndarray, np.nda
     return form.pattern, entries, full(form, entries)
 
 
-@pytest.mark.parametrize("kind", [DenseCholesky, SparseLDL])
+def installed() -> list[Any]:
+    packages = {"pardiso": "pypardiso", "cholmod": "cvxopt"}
+    return [cls for name, cls in CLASSES.items() if find_spec(packages.get(name, "numpy"))]
+
+
+@pytest.mark.parametrize("kind", installed())
 def test_factorizations_solve_again_and_again(kind: Any) -> None:
     for seed in range(3):
         pattern, entries, H = pattern_and_matrix(seed, 3.0)
@@ -345,7 +352,7 @@ def test_factorizations_solve_again_and_again(kind: Any) -> None:
             np.testing.assert_allclose(solver.solve(b), np.linalg.solve(scale * H, b), atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", [DenseCholesky, SparseLDL])
+@pytest.mark.parametrize("kind", installed())
 def test_matrices_that_are_not_finite_or_empty_are_refused_and_the_next_one_is_taken(kind: Any) -> None:
     pattern, entries, H = pattern_and_matrix(0, 3.0)
     solver = kind(pattern)

@@ -1,0 +1,263 @@
+"""Factorizations of positive definite matrices given by the upper triangle of a fixed pattern.
+
+Every class finds its order of elimination once and keeps it from one `factor` to the next. Which is fastest is a matter
+of the work that elimination takes (`HessianPattern.work`): scalar LDL' wins on trees and plane graphs, block methods
+where the factor fills in, as in pose graphs in space.
+"""
+
+from __future__ import annotations
+
+import copy
+import weakref
+from functools import cache
+from importlib.util import find_spec
+from typing import Any, ClassVar, Literal, Protocol
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from scipy.linalg.lapack import dpotrf, dpotrs  # type: ignore[attr-defined]
+
+from problems.errors import MissingExtraError
+from problems.forms.sparsity import HessianPattern
+
+DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
+BLOCK_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
+PARDISO_WORK = 5e7  # the same for Pardiso with its analysis, at five factorizations per solve
+
+LinearSolver = Literal["auto", "dense", "qdldl", "superlu", "pardiso", "cholmod"]
+
+
+class SingularError(ArithmeticError):
+    """The matrix is not positive definite to working precision."""
+
+
+class Factorization(Protocol):
+    name: ClassVar[str]
+
+    def __init__(self, pattern: HessianPattern) -> None: ...
+
+    def factor(self, values: np.ndarray) -> None:
+        """Take the entries in the order of the pattern. Raises SingularError."""
+        ...
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """For one right side (size,) or several (size, k)."""
+        ...
+
+
+class DenseCholesky:
+    """LAPACK Cholesky of the entries scattered into a full matrix."""
+
+    name: ClassVar[str] = "dense"
+
+    def __init__(self, pattern: HessianPattern) -> None:
+        self._matrix = np.zeros((pattern.size, pattern.size))
+        columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+        # transposed view: LAPACK reads columns, so the lower triangle of the row-major array is its upper one
+        self._flat = columns * pattern.size + pattern.indices
+        self._factor: Any = None
+
+    def factor(self, values: np.ndarray) -> None:
+        self._matrix.ravel()[self._flat] = values
+        self._factor, info = dpotrf(self._matrix.T, lower=0)
+        if info != 0:
+            raise SingularError(f"leading minor {info} is not positive")
+        if np.isnan(self._factor.diagonal()).any():
+            raise SingularError("the matrix is not finite")
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        return dpotrs(self._factor, right, lower=0)[0]
+
+
+class SparseLDL:
+    """QDLDL: scalar LDL' in an approximate minimum degree order."""
+
+    name: ClassVar[str] = "qdldl"
+
+    def __init__(self, pattern: HessianPattern) -> None:
+        self._pattern, shape = pattern, (pattern.size, pattern.size)
+        self._matrix = sp.csc_matrix((np.ones(pattern.nonzeros), pattern.indices, pattern.indptr), shape=shape)
+        self._solver: Any = None
+
+    def factor(self, values: np.ndarray) -> None:
+        import qdldl
+
+        _check(values, self._pattern)
+        self._matrix.data = values
+        try:
+            if self._solver is None:
+                self._solver = qdldl.Solver(self._matrix, upper=True)
+            else:
+                self._solver.update(self._matrix, upper=True)
+        except RuntimeError as error:
+            self._solver = None
+            raise SingularError(str(error)) from error
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        if right.ndim == 1:
+            return self._solver.solve(right)
+        return np.column_stack([self._solver.solve(np.ascontiguousarray(column)) for column in right.T])
+
+
+class SuperLU:
+    """SciPy's LU by blocks of columns, on the diagonal only, in a multiple minimum degree order."""
+
+    name: ClassVar[str] = "superlu"
+
+    def __init__(self, pattern: HessianPattern) -> None:
+        self._pattern = pattern
+        self._arrange(np.arange(pattern.size))
+        self._factor: Any = None
+
+    def factor(self, values: np.ndarray) -> None:
+        _check(values, self._pattern)
+        try:
+            self._matrix.data = values[self._source]
+            if self._factor is None:
+                found = _eliminated(self._matrix, "MMD_AT_PLUS_A")
+                self._arrange(np.argsort(found.perm_c))
+                self._matrix.data = values[self._source]
+            self._factor = _eliminated(self._matrix, "NATURAL")
+        except RuntimeError as error:
+            raise SingularError(str(error)) from error
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        out = np.empty_like(right)
+        out[self._order] = self._factor.solve(right[self._order])
+        return out
+
+    def _arrange(self, order: np.ndarray) -> None:
+        """Both triangles in this order of elimination, and where their entries stand in the pattern."""
+        pattern, n = self._pattern, self._pattern.size
+        place = np.empty(n, np.intp)
+        place[order] = np.arange(n)
+        rows = place[pattern.indices]
+        columns = place[np.repeat(np.arange(n), np.diff(pattern.indptr))]
+        off = np.flatnonzero(rows != columns)
+        entries = np.concatenate([np.arange(rows.size), off]) + 1.0
+        ends = (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]]))
+        self._matrix = sp.csc_matrix((entries, ends), shape=(n, n))
+        self._source = self._matrix.data.astype(np.intp) - 1
+        self._order = order
+
+
+class Pardiso:
+    """MKL's supernodal Cholesky (extra ``pardiso``), its three phases called one by one."""
+
+    name: ClassVar[str] = "pardiso"
+
+    def __init__(self, pattern: HessianPattern) -> None:
+        entries, shape = np.arange(pattern.nonzeros) + 1.0, (pattern.size, pattern.size)
+        self._pattern = pattern
+        self._matrix = sp.csc_matrix((entries, pattern.indices, pattern.indptr), shape=shape).tocsr()
+        self._source = self._matrix.data.astype(np.intp) - 1
+        self._solver: Any = None
+
+    def factor(self, values: np.ndarray) -> None:
+        _check(values, self._pattern)
+        self._matrix.data = values[self._source]
+        if self._solver is None:
+            solver = _pardiso()
+            weakref.finalize(self, solver.free_memory, True)
+            self._call(solver, 11)
+            self._solver = solver
+        self._call(self._solver, 22)
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        return self._call(self._solver, 33, right)
+
+    def _call(self, solver: Any, phase: int, right: np.ndarray | None = None) -> np.ndarray:
+        from pypardiso.pardiso_wrapper import PyPardisoError
+
+        solver.set_phase(phase)
+        columns = np.zeros(self._pattern.size) if right is None else np.asfortranarray(right)
+        try:
+            return solver._call_pardiso(self._matrix, columns)
+        except PyPardisoError as error:
+            raise SingularError(f"pardiso error {error.value}") from error
+
+
+class CHOLMOD:
+    """CHOLMOD's supernodal Cholesky through cvxopt (extra ``gpl``)."""
+
+    name: ClassVar[str] = "cholmod"
+
+    def __init__(self, pattern: HessianPattern) -> None:
+        try:
+            import cvxopt
+        except ModuleNotFoundError as error:
+            raise MissingExtraError("linear solver cholmod", "cvxopt", "gpl") from error
+        self._pattern = pattern
+        columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+        self._matrix = cvxopt.spmatrix(1.0, pattern.indices.tolist(), columns.tolist(), (pattern.size, pattern.size))
+        self._factor: Any = None
+
+    def factor(self, values: np.ndarray) -> None:
+        import cvxopt
+        import cvxopt.cholmod
+
+        _check(values, self._pattern)
+        self._matrix.V = cvxopt.matrix(values)
+        if self._factor is None:
+            self._factor = cvxopt.cholmod.symbolic(self._matrix, uplo="U")
+        try:
+            cvxopt.cholmod.numeric(self._matrix, self._factor)
+        except ArithmeticError as error:
+            raise SingularError(f"leading minor {error} is not positive") from error
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        import cvxopt
+        import cvxopt.cholmod
+
+        out: Any = cvxopt.matrix(np.ascontiguousarray(right))
+        cvxopt.cholmod.solve(self._factor, out)
+        return np.array(out).reshape(right.shape)
+
+
+CLASSES: dict[str, type[Factorization]] = {
+    cls.name: cls for cls in (DenseCholesky, SparseLDL, SuperLU, Pardiso, CHOLMOD)
+}
+
+
+def factorization(pattern: HessianPattern, solver: LinearSolver = "auto") -> Factorization:
+    """The factorization called `solver`, or the one that is fastest for this pattern among what is installed.
+
+    Raises:
+        MissingExtraError: its package is not installed.
+    """
+    if solver == "auto":
+        if pattern.size <= DENSE_SIZE:
+            solver = "dense"
+        elif pattern.work >= PARDISO_WORK and find_spec("pypardiso") is not None:
+            solver = "pardiso"
+        else:
+            solver = "superlu" if pattern.work >= BLOCK_WORK else "qdldl"
+    elif solver == "pardiso" and find_spec("pypardiso") is None:
+        raise MissingExtraError("linear solver pardiso", "pypardiso", "pardiso")
+    return CLASSES[solver](pattern)
+
+
+def _check(values: np.ndarray, pattern: HessianPattern) -> None:
+    if not np.isfinite(values).all():
+        raise SingularError("the matrix is not finite")
+    if (values[pattern.diagonal] <= 0).any():
+        raise SingularError("a diagonal entry is not positive")
+
+
+def _eliminated(matrix: Any, order: str) -> Any:
+    return spla.splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+@cache
+def _pardiso_template() -> Any:
+    # constructing one searches the whole environment for the library (0.25 s), so all are copies of the first
+    import pypardiso
+
+    return pypardiso.PyPardisoSolver(mtype=2)
+
+
+def _pardiso() -> Any:
+    solver = copy.copy(_pardiso_template())
+    solver.pt, solver.iparm = np.zeros_like(solver.pt), np.zeros_like(solver.iparm)
+    return solver
