@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ def folders(data_dir: Path) -> dict[str, Path]:
     return found
 
 
-@lru_cache(maxsize=None)
+@cache
 def localized(folder: Path, *words: str) -> dict:
     """The only row that `horizonet localize` prints for a recording."""
     result = CliRunner().invoke(app, ["localize", str(folder), "--json", *words])
