@@ -157,7 +157,7 @@ class SeedArrival(ArrivalCost):
         return super().start()
 
     def slide(self, now: WindowState) -> dict[str, Any]:
-        data: dict[str, Any] = {"reference": now.states[1]}
+        data: dict[str, Any] = {"reference": now.states[1:2]}
         if self.rule == "constant":
             return data
         used = self.window.used(now.measurements[0])
@@ -220,7 +220,7 @@ class SmoothingArrival(ArrivalCost):
         data = self._information(matrix)
         if data:
             self._matrices = {}
-        return {"reference": reference, "linear": weighted @ deviation, **data}
+        return {"reference": reference[None], "linear": (weighted @ deviation)[None], **data}
 
 
 def arrival_cost(

@@ -34,5 +34,8 @@ class AffineMarginal:
     def __call__(self, numbers: np.ndarray, point: np.ndarray) -> Marginal:
         reference = self._plan.references(point)
         x = np.concatenate([part.ravel() for part in reference])
-        vector = -(self._G @ numbers + self._g + self.M @ x)
+        vector = self._G.dot(numbers)
+        vector += self.M.dot(x)
+        vector += self._g
+        np.negative(vector, out=vector)
         return Marginal(tuple(self._plan.slots), self.M, vector, reference)

@@ -126,15 +126,15 @@ def _clearly_solved(
     P: Any, q: np.ndarray, A: Any, l: np.ndarray, u: np.ndarray, x: np.ndarray, y: np.ndarray, tolerance: float
 ) -> bool:
     """Whether the residuals are within `tolerance` even without their sizes: a third of the work, and mostly enough."""
-    Px = P @ x
+    Px = P.dot(x)
     dual = Px + q
     if l.size:
-        Ax = A @ x
+        Ax = A.dot(x)
         if not np.maximum.reduce(np.maximum(Ax - u, l - Ax)) <= tolerance:
             return False
         active = y.nonzero()[0]
         multipliers = y[active]
-        dual += A.T @ y
+        dual += A.T.dot(y)
         gap = multipliers.dot(np.where(multipliers > 0, u[active], l[active]))
     else:
         gap = 0.0

@@ -82,7 +82,7 @@ class DenseMap:
 
     def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """All unknowns (n,) and the violations of all bounds (<= 0 where they hold)."""
-        out = self.T @ numbers
+        out = self.T.dot(numbers)  # half the overhead of the operator
         out += self.t
         return out[: self.size], out[self.size :]
 
@@ -115,7 +115,7 @@ class _Vectors:
             self._fixed = l + reduced.c, u + reduced.c
 
     def __call__(self, numbers: np.ndarray) -> Vectors:
-        out = self._B @ numbers
+        out = self._B.dot(numbers)
         out += self._b
         first, second = self._ends
         if self._fixed is None:

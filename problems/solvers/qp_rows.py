@@ -6,7 +6,7 @@ a check costs a few matrix-vector products.
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,14 +19,18 @@ from problems.forms.quadratic import QuadraticProgram
 from problems.problem import DataSlot
 from problems.solvers.active import active_rows
 from problems.solvers.linear import covariance_blocks
+from problems.solvers.qp_maps import DenseMap
 
 
 class StackedRows:
-    """Rows ``R z + E d + c`` of costs, the same weighted, of equalities and of inequalities, one below the other.
+    """Gradient of the costs, equalities and inequalities as affine rows ``M z + D d + m``, one below the other.
 
     Args:
         store: the numbers of a solve, missing ones read as zero; its weights and matrices are taken.
         flags: active instances of each term by name, None where all are.
+
+    Attributes:
+        equalities, inequalities: name, place among the rows of its kind, and shape of each term.
     """
 
     def __init__(self, program: QuadraticProgram, store: DataStore, flags: dict[str, np.ndarray | None]) -> None:
@@ -37,65 +41,44 @@ class StackedRows:
             [r for r in rows if r.layout.term.kind == k] for k in ("cost", "equality", "inequality")
         )
         weighted = [_weighted(r, information_of(r, store, flags.get(r.layout.term.name))) for r in costs]
-        parts = [*costs, *weighted, *equal, *bounded]
-        self._R = _stacked([r.R for r in parts], size, program.dense)
-        self._E = _stacked([r.E for r in parts], data, program.dense)
-        self._c = np.concatenate([np.zeros(0), *(r.c for r in parts)])
-        ends = np.cumsum([0, *(sum(r.count * r.dim for r in part) for part in (costs, costs, equal, bounded))])
-        self._costs, self._weighted, self._equal, self._bounded = (
-            slice(a, b) for a, b in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+        self._costs, self._weighted = (
+            _stacked(costs, size, data, self._dense),
+            _stacked(weighted, size, data, self._dense),
         )
-        self._linear(costs, flags)
+        self._linear = _linear(costs, flags, data)
+        slope_d, slope = self._weighted[1] + self._linear[0], self._weighted[2] + self._linear[1]
+        R = self._costs[0].T
+        self._hessian = R @ self._weighted[0]
+        others = _stacked([*equal, *bounded], size, data, self._dense)
+        join: Any = np.vstack if self._dense else partial(sp.vstack, format="csr")
+        self._M = join([self._hessian, others[0]])
+        self._D = join([R @ slope_d, others[1]])
+        self._m = np.concatenate([R @ slope, others[2]])
         self.equalities, self.inequalities = _named(equal), _named(bounded)
-        off = [_off(r, flags.get(r.layout.term.name)) for r in bounded]
-        self._off = np.concatenate([np.zeros(0, bool), *off])
+        middle = size + (self.equalities[-1][1].stop if equal else 0)
+        self._gradient, self._equal, self._bounded = slice(0, size), slice(size, middle), slice(middle, None)
+        self._equal_rows, self._bounded_rows = self._M[self._equal], self._M[self._bounded]
+        self._off = np.concatenate([np.zeros(0, bool), *(_off(r, flags.get(r.layout.term.name)) for r in bounded)])
         self._limits = (Bounds.of(program.layout, bounded, "lower"), Bounds.of(program.layout, bounded, "upper"))
         self._fixed = None if any((b.index >= 0).any() for b in self._limits) else self._bounds(store.numbers)
-        self._gradient_rows = self._R[self._costs].T
-        self._equal_rows, self._bounded_rows = self._R[self._equal], self._R[self._bounded]
+        self._certificate: tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]] | None = None
         self._covariances: dict[bytes, np.ndarray] = {}
 
-    def _linear(self, costs: list[Rows], flags: dict[str, np.ndarray | None]) -> None:
-        """Linear parts of all cost rows: constants, and where which data go."""
-        constants, at, index = [np.zeros(0)], [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
-        start, self._has_linear = 0, False
-        for r in costs:
-            term, size = r.layout.term, r.count * r.dim
-            constant = np.zeros(size)
-            if term.linear is not None:
-                self._has_linear = True
-                on = ~_off(r, flags.get(term.name))
-                if isinstance(term.linear, DataSlot):
-                    assert r.layout.linear is not None
-                    at.append(start + np.flatnonzero(on))
-                    index.append(np.broadcast_to(r.layout.linear, (r.count, r.dim)).ravel()[on])
-                else:
-                    constant = constant_rows(term.linear, r.dim, r.count, term.what).ravel() * on
-            constants.append(constant)
-            start += size
-        self._linear_constant = np.concatenate(constants)
-        self._linear_at, self._linear_index = np.concatenate(at), np.concatenate(index)
-
     def values(self, z: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """All rows at the point z (n,) for the vector data d."""
-        return self._R @ z + self._E @ d + self._c
+        """All rows at the point z (n,) for the data d."""
+        out = self._M.dot(z)
+        out += self._D.dot(d)
+        out += self._m
+        return out
 
-    def _slope(self, values: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, float]:
-        """Derivative of the cost with respect to its rows, and the cost."""
-        r, s = values[self._costs], values[self._weighted]
-        if not self._has_linear:
-            return s, 0.5 * float(r @ s)
-        linear = self._linear_constant.copy()
-        linear[self._linear_at] = d[self._linear_index]
-        return s + linear, 0.5 * float(r @ s) + float(linear @ r)
+    def objective(self, z: np.ndarray, d: np.ndarray) -> float:
+        r, s = (R @ z + E @ d + c for R, E, c in (self._costs, self._weighted))
+        return float(r @ (0.5 * s + (self._linear[0] @ d + self._linear[1])))
 
-    def objective(self, values: np.ndarray, d: np.ndarray) -> float:
-        return self._slope(values, d)[1]
-
-    def gradient(self, values: np.ndarray, d: np.ndarray, mu: np.ndarray | None) -> np.ndarray:
+    def gradient(self, values: np.ndarray, mu: np.ndarray | None) -> np.ndarray:
         """Of costs and inequalities with multipliers `mu` (None: none is active)."""
-        g = self._gradient_rows @ self._slope(values, d)[0]
-        return g if mu is None else g + self._bounded_rows.T @ mu
+        g = values[self._gradient]
+        return g if mu is None else g + self._bounded_rows.T.dot(mu)
 
     @cached_property
     def _inverse(self) -> np.ndarray:
@@ -103,14 +86,11 @@ class StackedRows:
 
     @cached_property
     def _solve_normal(self) -> Any:
-        normal = self._equal_rows @ self._equal_rows.T
-        # rows that repeat or are empty share their multiplier instead of making the system singular
-        ridge = 1e-14 * max(float(normal.diagonal().max(initial=0.0)), 1e-300)
-        return spla.factorized(sp.csc_matrix(normal + ridge * sp.eye_array(normal.shape[0])))
+        return spla.factorized(sp.csc_matrix(self._equal_rows @ self._equal_rows.T))
 
     def equality_multipliers(self, gradient: np.ndarray) -> np.ndarray:
         """Least-squares multipliers: what remains of the stationarity condition is its residual."""
-        if not self._equal_rows.shape[0]:
+        if not self.equalities:
             return np.zeros(0)
         if self._dense:
             return -(self._inverse @ gradient)
@@ -118,21 +98,51 @@ class StackedRows:
 
     def residuals(
         self, values: np.ndarray, d: np.ndarray, mu: np.ndarray | None, gradient: np.ndarray, lam: np.ndarray
-    ) -> dict[str, float]:
-        """``primal``, ``dual`` and ``gap``."""
-        dual = gradient + self._equal_rows.T @ lam if lam.size else gradient
-        primal = float(np.abs(values[self._equal]).max()) if lam.size else 0.0
-        gap = 0.0
-        r = values[self._bounded]
-        if r.size:
+    ) -> tuple[float, float, float]:
+        """``primal``, ``dual`` and the absolute gap."""
+        primal, gap, dual = 0.0, 0.0, gradient
+        if self.equalities:
+            dual = gradient + self._equal_rows.T @ lam
+            primal = float(np.abs(values[self._equal]).max())
+        if self.inequalities:
+            r = values[self._bounded]
             lower, upper = self.bounds(d)
-            primal = max(primal, float((r - upper).max()), float((lower - r).max()))
+            primal = max(primal, float(np.maximum.reduce(np.maximum(r - upper, lower - r))))
             if mu is not None:
-                bound = np.where(mu > 0, upper, np.where(mu < 0, lower, r))
+                held = mu.nonzero()[0]
+                force = mu[held]
+                missed = np.where(force > 0, upper[held], lower[held]) - r[held]
                 # a multiplier on a side without a bound is no certificate: let the gap show it
-                missed = np.abs(mu * np.where(np.isfinite(bound), bound - r, np.sign(mu))).sum()
-                gap = float(missed) / max(1.0, abs(self.objective(values, d)))
-        return {"primal": primal, "dual": float(np.abs(dual).max()) if dual.size else 0.0, "gap": gap}
+                missed[np.isinf(missed)] = 1.0
+                gap = float(np.abs(force).dot(np.abs(missed)))
+        return primal, float(np.maximum.reduce(np.abs(dual))), gap
+
+    def certified(self, map_: DenseMap, d: np.ndarray, violation: float) -> dict[str, float]:
+        """Bounds of the residuals of an answer of the affine map, whose largest violation of a bound is given.
+
+        Residuals of that answer are affine in the data themselves, zero but for rounding; how far from it is worked
+        out once for each map, the rounding of the product that gave the answer included.
+        """
+        if self._certificate is None:
+            self._certificate = self._certify(map_)
+        size = np.abs(d)
+        (dual, dual_constant), (primal, primal_constant) = self._certificate
+        equal = float(primal.dot(size)) + primal_constant if self.equalities else 0.0
+        return {"primal": max(equal, violation, 0.0), "dual": float(dual.dot(size)) + dual_constant, "gap": 0.0}
+
+    def _certify(self, map_: DenseMap) -> tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]:
+        n = map_.size
+        V = np.column_stack([map_.T[:n], map_.t[:n]])
+        given = np.column_stack([self._D, self._m])
+        values, sizes = self._M @ V + given, np.abs(self._M) @ np.abs(V) + np.abs(given)
+        dual = values[self._gradient]
+        if self.equalities:
+            dual = dual - self._equal_rows.T @ (self._inverse @ dual)
+        rounding = 2 * V.shape[1] * np.finfo(float).eps
+        parts = ((dual, sizes[self._gradient]), (values[self._equal], sizes[self._equal]))
+        largest = [(np.abs(exact) + rounding * size).max(axis=0, initial=0.0) for exact, size in parts]
+        first, second = ((np.ascontiguousarray(part[:-1]), float(part[-1])) for part in largest)
+        return first, second
 
     def bounds(self, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of all inequality rows, infinite where an instance is off."""
@@ -152,10 +162,30 @@ class StackedRows:
         key = columns.tobytes()
         found = self._covariances.get(key)
         if found is None:
-            P = self._R[self._costs].T @ self._R[self._weighted]
-            found = covariance_blocks(self._layout, sp.csr_array(P), sp.csr_array(self._equal_rows), columns)
-            self._covariances[key] = found
+            hessian, equal = sp.csr_array(self._hessian), sp.csr_array(self._equal_rows)
+            found = self._covariances[key] = covariance_blocks(self._layout, hessian, equal, columns)
         return found.copy()
+
+
+def _linear(costs: list[Rows], flags: dict[str, np.ndarray | None], data: int) -> tuple[Matrix, np.ndarray]:
+    """Linear parts of all cost rows as an affine function of the data."""
+    constants, at, index, start = [np.zeros(0)], [np.zeros(0, np.intp)], [np.zeros(0, np.intp)], 0
+    for r in costs:
+        term, size = r.layout.term, r.count * r.dim
+        constant = np.zeros(size)
+        if term.linear is not None:
+            on = ~_off(r, flags.get(term.name))
+            if isinstance(term.linear, DataSlot):
+                assert r.layout.linear is not None
+                at.append(start + np.flatnonzero(on))
+                index.append(np.broadcast_to(r.layout.linear, (r.count, r.dim)).ravel()[on])
+            else:
+                constant = constant_rows(term.linear, r.dim, r.count, term.what).ravel() * on
+        constants.append(constant)
+        start += size
+    rows, columns = np.concatenate(at), np.concatenate(index)
+    taken = sp.csr_array((np.ones(rows.size), (rows, columns)), shape=(start, data))
+    return taken, np.concatenate(constants)
 
 
 def _weighted(rows: Rows, W: np.ndarray) -> Rows:
@@ -169,10 +199,18 @@ def _weighted(rows: Rows, W: np.ndarray) -> Rows:
     return Rows(rows.layout, rows.dim, R, E, c)
 
 
-def _stacked(parts: list[Matrix], width: int, dense: bool) -> Matrix:
+def _stacked(parts: list[Rows], size: int, data: int, dense: bool) -> tuple[Matrix, Matrix, np.ndarray]:
+    """R, E and c of all terms, one below the other."""
+    c = np.concatenate([np.zeros(0), *(r.c for r in parts)])
     if dense:
-        return np.ascontiguousarray(np.vstack([np.zeros((0, width)), *parts]))
-    return sp.vstack([sp.csr_array((0, width)), *parts], format="csr")
+        R, E = (np.vstack([np.zeros((0, w)), *(m for m in ms)]) for w, ms in _columns(parts, size, data))
+    else:
+        R, E = (sp.vstack([sp.csr_array((0, w)), *ms], format="csr") for w, ms in _columns(parts, size, data))
+    return R, E, c
+
+
+def _columns(parts: list[Rows], size: int, data: int) -> tuple[tuple[int, list[Matrix]], tuple[int, list[Matrix]]]:
+    return (size, [r.R for r in parts]), (data, [r.E for r in parts])
 
 
 def _off(rows: Rows, on: np.ndarray | None) -> np.ndarray:

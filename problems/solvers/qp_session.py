@@ -138,8 +138,10 @@ class QPSession(Session):
             )
         if self.screens and map_.definite:
             z, excess = map_(numbers)
-            if not excess.size or excess.max() <= self.options.tolerance:
-                return Solution(self.layout, z, Status.SOLVED, "linear", _check(self, numbers, map_, z))
+            violation = float(np.maximum.reduce(excess)) if excess.size else 0.0
+            if violation <= self.options.tolerance:
+                check = QPCheck(self.program, self.store, numbers.copy(), map_, z, None, violation)
+                return Solution(self.layout, z, Status.SOLVED, "linear", check)
         return self._solve_qp(map_, numbers)
 
     def _marginal(self, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
@@ -195,7 +197,8 @@ class QPSession(Session):
                 result.iterations,
                 result.message,
             )
-        z = reduced.map.Z @ result.x + offset
+        z = reduced.map.Z.dot(result.x)
+        z += offset
         self.last = (result.x, result.y)
         check = _check(self, numbers, map_, z, result.y[reduced.equalities :])
         return Solution(self.layout, z, status, self.solver, check, result.iterations, result.message)

@@ -17,6 +17,8 @@ from problems.forms.selection import columns_of
 from problems.solvers.qp_maps import DenseMap, SparseMap
 from problems.solvers.qp_rows import StackedRows
 
+NEGLIGIBLE = 1e-13  # a gap so small needs no comparison with the objective
+
 
 class QPCheck:
     """Implements `problems.solvers.session.Check`.
@@ -26,9 +28,10 @@ class QPCheck:
         map_: for the weights and the pattern of that solve; keeps the stacked rows for all its solutions.
         z: all unknowns.
         mu: multipliers of all inequality rows; None where no row was active.
+        violation: largest violation of a bound where `map_` itself gave the answer, else None.
     """
 
-    __slots__ = ("__dict__", "_map", "_mu", "_numbers", "_program", "_store", "_z")
+    __slots__ = ("__dict__", "_map", "_mu", "_numbers", "_program", "_store", "_violation", "_z")
 
     def __init__(
         self,
@@ -38,9 +41,10 @@ class QPCheck:
         map_: DenseMap | SparseMap,
         z: np.ndarray,
         mu: np.ndarray | None,
+        violation: float | None = None,
     ) -> None:
         self._program, self._store, self._numbers = program, store, numbers
-        self._map, self._z, self._mu = map_, z, mu
+        self._map, self._z, self._mu, self._violation = map_, z, mu, violation
 
     @property
     def _rows(self) -> StackedRows:
@@ -56,20 +60,30 @@ class QPCheck:
     @cached_property
     def _gradient(self) -> np.ndarray:
         """Of costs and active inequalities with respect to all unknowns."""
-        return self._rows.gradient(self._values, self._numbers, self._mu)
+        return self._rows.gradient(self._values, self._mu)
 
     @cached_property
     def _equality_multipliers(self) -> np.ndarray:
         return self._rows.equality_multipliers(self._gradient)
 
     def objective(self) -> float:
-        return self._rows.objective(self._values, self._numbers)
+        return self._rows.objective(self._z, self._numbers)
 
     def residuals(self) -> dict[str, float]:
-        return self._rows.residuals(self._values, self._numbers, self._mu, self._gradient, self._equality_multipliers)
+        rows = self._rows
+        if self._violation is not None and isinstance(self._map, DenseMap):
+            return rows.certified(self._map, self._numbers, self._violation)
+        primal, dual, gap = rows.residuals(
+            self._values, self._numbers, self._mu, self._gradient, self._equality_multipliers
+        )
+        if gap > NEGLIGIBLE:
+            gap /= max(1.0, abs(self.objective()))
+        return {"primal": primal, "dual": dual, "gap": gap}
 
     def multipliers(self) -> dict[str, np.ndarray]:
         rows = self._rows
+        if self._mu is None and not rows.equalities:
+            return {name: np.zeros(shape) for name, _, shape in rows.inequalities}
         out = {name: self._equality_multipliers[part].reshape(shape) for name, part, shape in rows.equalities}
         for name, part, shape in rows.inequalities:
             out[name] = np.zeros(shape) if self._mu is None else self._mu[part].reshape(shape)
