@@ -8,7 +8,7 @@ takes is reported as ``setup``. We iterate ourselves, with a clock and a tight t
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from problems.errors import FormError
 from problems.forms.factor_graph import FactorGraph, GraphTerm
 from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.template import template_of
+from problems.noise import L2, GemanMcClure
 from problems.problem import DataSlot, Problem
 from problems.solvers.base import Options, Status
 from problems.solvers.least_squares_solution import LeastSquaresCheck
@@ -240,3 +241,81 @@ class Dogleg(GtsamSession):
     name = "gtsam-dogleg"
     optimizer = "Dogleg"
     settings_type = DoglegSettings
+
+
+@dataclass(frozen=True)
+class GNCSettings(LevenbergMarquardtSettings):
+    """Settings of ``gtsam-gnc``; None keeps gtsam's default. Those of ``gtsam-lm`` are for its inner solves.
+
+    Attributes:
+        lambdaStep: factor by which the loss is sharpened from one inner problem to the next.
+    """
+
+    lambdaStep: float | None = None
+
+
+class GraduatedNonConvexity(GtsamSession):
+    """Session of the solver ``gtsam-gnc``: for costs with the Geman-McClure loss, from starts with gross outliers.
+
+    The loss is made convex first and sharpened step by step (Yang et al., Graduated Non-Convexity for Robust Spatial
+    Perception, 2020); Levenberg-Marquardt then goes to the optimum of the loss itself. The first part cannot be
+    stopped by the clock, and its iterations are not counted.
+
+    Raises:
+        FormError: no cost has that loss, or several scales or another loss occur; a term is no factor of gtsam's own.
+    """
+
+    name = "gtsam-gnc"
+    optimizer = "LevenbergMarquardt"
+    settings_type = GNCSettings
+
+    def __init__(self, problem: Problem, options: Options) -> None:
+        super().__init__(problem, options)
+        scales = set()
+        for term in problem.terms.values():
+            if isinstance(term.loss, GemanMcClure):
+                scales.add(term.loss.scale)
+            elif not isinstance(term.loss, L2):
+                raise FormError(f"{term.what}: solver 'gtsam-gnc' knows the loss GemanMcClure only, got {term.loss!r}")
+        if len(scales) != 1:
+            raise FormError(
+                "solver 'gtsam-gnc' needs costs with the loss GemanMcClure, all of one scale; got "
+                f"{sorted(scales) or 'none'}. Without outliers use 'gtsam-lm'"
+            )
+        for term in self.graph.terms:
+            if term.kind not in ("native", "pinned"):
+                raise FormError(
+                    f"{self.problem.terms[term.name].what}: solver 'gtsam-gnc' takes gtsam's own factors only, and "
+                    f"this is a {term.kind} one: {term.reason or 'an equality'}"
+                )
+        # gtsam compares errors, which are half the squared norm
+        self._threshold = scales.pop() ** 2 / 2
+
+    def _translated(self, settings: Settings) -> Any:
+        import gtsam
+
+        assert isinstance(settings, GNCSettings)
+        inner = super()._translated(replace(settings, lambdaStep=None))
+        self._graduated = gtsam.GncLMParams(inner)
+        self._graduated.setLossType(gtsam.GncLossType.GM)
+        if settings.lambdaStep is not None:
+            self._graduated.setLambdaStep(settings.lambdaStep)
+        return inner
+
+    def _run(self, graph: Any, values: Any) -> tuple[Status, str, int, Any]:
+        import gtsam
+
+        certain, position = [], 0
+        for term in self.graph.terms:
+            count = len(self._factors[term.name][1])
+            if isinstance(self.problem.terms[term.name].loss, L2):
+                certain += range(position, position + count)
+            position += count
+        self._graduated.setKnownInliers(certain)
+        try:
+            optimizer = gtsam.GncLMOptimizer(graph, values, self._graduated)
+            optimizer.setInlierCostThresholds(self._threshold)
+            values = optimizer.optimize()
+        except Exception as error:  # a library that breaks is a status
+            return Status.FAILED, f"gtsam raised {type(error).__name__}: {' '.join(str(error).split())[:300]}", 0, None
+        return super()._run(graph, values)

@@ -239,3 +239,46 @@ def test_rotations_and_points_in_space() -> None:
     assert np.abs(SE3.local_array(solution["T"], ours["T"])).max() < 1e-6
     np.testing.assert_allclose(solution["x"], ours["x"], atol=1e-6)
     assert solution["R"][0, 0] == pytest.approx(3.0)
+
+
+def outliers(loss: Loss | None, angles: Any = "geodesic") -> tuple[Problem, dict[str, Any], dict[str, Any], np.ndarray]:
+    """A team whose relative measurements are wrong to a quarter, and the poorest start: raw GPS."""
+    rng = np.random.default_rng(3)
+    team = draw_lattice(49, rng, pairs="both")
+    seen = team.range_bearing.copy()
+    bad = rng.permutation(len(seen))[: len(seen) // 4]
+    seen[bad, 0] += 8 * rng.normal(size=bad.size)
+    seen[bad, 1] = wrap(seen[bad, 1] + rng.normal(size=bad.size))
+    p = Problem("outliers")
+    robot = p.variables("robot", SE2, 49)
+    fixes, headings, z = p.data("fixes", 2, 49), p.data("headings", (), 49), p.data("seen", 2, len(seen))
+    residual = meas.bearing_range if angles == "geodesic" else meas.bearing_range_chordal
+    p.cost("gps", meas.position, robot, fixes, Gaussian(2.0))
+    p.cost("compass", meas.heading, robot, headings, Gaussian(0.05))
+    p.cost("pairs", residual, (robot[team.observer], robot[team.target]), z, Gaussian([0.1, 0.03]), loss)
+    data = {"fixes": team.gps, "headings": team.compass, "seen": seen}
+    assert team.truth is not None
+    return p, data, {"robot": np.column_stack([team.gps, team.compass])}, team.truth
+
+
+def test_graduated_nonconvexity_finds_the_optimum_near_the_truth() -> None:
+    problem, data, start, truth = outliers(GemanMcClure(3.0))
+    best = problem.compile("gauss-newton").solve(data, initial={"robot": truth})
+    stuck = problem.compile("gtsam-lm").solve(data, initial=start)
+    found = problem.compile("gtsam-gnc").solve(data, initial=start)
+    assert found.status is Status.SOLVED and found.method == "gtsam-gnc"
+    assert stuck.objective > 1.2 * best.objective
+    assert found.objective == pytest.approx(best.objective, rel=1e-6)
+
+
+def test_graduated_nonconvexity_says_what_it_does_not_take() -> None:
+    for loss in (None, Huber(1.0)):
+        with pytest.raises(FormError, match="GemanMcClure"):
+            outliers(loss)[0].compile("gtsam-gnc")
+    problem = outliers(GemanMcClure(3.0))[0]
+    robot = problem.unknowns["robot"]
+    problem.cost("more", meas.heading, robot, problem.data("h"), loss=GemanMcClure(1.0))
+    with pytest.raises(FormError, match="one scale"):
+        problem.compile("gtsam-gnc")
+    with pytest.warns(SlowPathWarning), pytest.raises(FormError, match="'pairs'.*custom"):
+        outliers(GemanMcClure(3.0), "chordal")[0].compile("gtsam-gnc")
