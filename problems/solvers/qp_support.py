@@ -214,7 +214,7 @@ def _same_pattern(one: Any, other: Any) -> bool:
 
 
 def sorted_csc(matrix: Any) -> Any:
-    """A sparse matrix as float64 ``csc_array`` with sorted indices and no duplicates; itself if it is one already."""
+    """A sparse matrix as float64 ``csc_array`` with sorted 32-bit indices and no duplicates; itself if it is one."""
     from scipy.sparse import csc_array
 
     if not isinstance(matrix, csc_array) or matrix.dtype != np.float64:
@@ -222,6 +222,10 @@ def sorted_csc(matrix: Any) -> Any:
     if not matrix.has_canonical_format:
         matrix = matrix.copy()
         matrix.sum_duplicates()
+    if matrix.indices.dtype != np.int32 or matrix.indptr.dtype != np.int32:
+        # libraries in C refuse others, and products of scipy's matrices sometimes have them
+        small = (matrix.data, matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32))
+        matrix = csc_array(small, shape=matrix.shape)
     return matrix
 
 
