@@ -53,7 +53,8 @@ def plot_tracks(recording: UwbRecording, tracks: Mapping[str, Track]) -> Figure:
     above.plot(recording.anchors[:, 0], recording.anchors[:, 1], "k^", ms=8, label="anchors")
     if truth is not None:  # a track that left the scene must not hide the others
         shown = np.vstack([recording.anchors[:, :2], truth.value[:, :2]])
-        low, high = shown.min(axis=0) - 5, shown.max(axis=0) + 5
+        margin = 0.1 * np.ptp(shown, axis=0).max()
+        low, high = shown.min(axis=0) - margin, shown.max(axis=0) + margin
         above.set_xlim(low[0], high[0])
         above.set_ylim(low[1], high[1])
     above.set_aspect("equal", adjustable="box")
@@ -64,7 +65,8 @@ def plot_tracks(recording: UwbRecording, tracks: Mapping[str, Track]) -> Figure:
     if below is not None:
         below.set_xlabel("time (s)")
         below.set_ylabel("horizontal error (m)")
-        below.set_ylim(0, 3 * min(peaks) if peaks else None)  # outbreaks of a bad track must not flatten the others
+        if peaks:  # outbreaks of a bad track must not flatten the others
+            below.set_ylim(0, min(3 * min(peaks), 1.05 * max(peaks)))
         below.grid(alpha=0.3)
     return figure
 
