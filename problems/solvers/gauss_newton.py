@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from problems.errors import SettingError, UnobservableError
+from problems.forms.graduated import ladder
 from problems.forms.layout import Layout
 from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
@@ -30,6 +31,7 @@ from problems.solvers.settings import own_version
 
 DAMPING_START = 1e-6
 DAMPING_LIMIT = 1e12
+RUNG_ITERATIONS = 10  # of each wider loss in graduated non-convexity
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Settings:
             called.
         linear_solver: factorization of the normal equations: ``dense``, ``qdldl``, ``superlu``, ``pardiso`` (extra
             ``pardiso``), ``cholmod`` (extra ``gpl``), or ``auto``: by size, work and what is installed.
+        graduated: graduated non-convexity: come to the robust losses from wider ones, past local minima of outliers.
     """
 
     qp_solver: str | None = None
@@ -51,6 +54,7 @@ class Settings:
     iterations: int | None = None
     screen: bool = True
     linear_solver: LinearSolver = "auto"
+    graduated: bool = False
 
 
 class GaussNewton(Session):
@@ -73,6 +77,8 @@ class GaussNewton(Session):
         pattern = self.form_.pattern
         self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._linear = factorization(pattern, self.settings.linear_solver)
+        rungs = ladder(problem) if self.settings.graduated else []
+        self._rungs = [LeastSquares(rung, Layout(rung), self.settings.whole) for rung in rungs]
         self._renew()
 
     @classmethod
@@ -121,10 +127,17 @@ class GaussNewton(Session):
         start = self.layout.identity() if self._point is None else self._point
         prepared, self._prepared = self._prepared, None
         if prepared is None:
-            search = _Search(self, bound, self.pins.apply(start, bound.numbers))
+            start = self.pins.apply(start, bound.numbers)
+            iterations = 0
+            for rung in self._rungs:
+                wider = _Search(self, rung.bind(self.store), start)
+                wider.run(RUNG_ITERATIONS)
+                start, iterations = wider.point, iterations + wider.iterations
+            search = _Search(self, bound, start)
             violation = self.pins.violation(search.point, bound.numbers)
             if violation <= 10 * self.options.tolerance:
                 status, message = search.run()
+                search.iterations += iterations
             else:
                 names = ", ".join(sorted(self.pins.names))
                 status, message = Status.INFEASIBLE, f"no point found that satisfies {names}: {violation:.3g} remains"
@@ -154,10 +167,10 @@ class _Search:
         if session.constraints.size or not session.settings.screen:
             self.lower, self.upper = session.constraints.bounds(bound.numbers, bound.flags)
 
-    def run(self) -> tuple[Status, str]:
+    def run(self, at_most: int | None = None) -> tuple[Status, str]:
         deadline = time.perf_counter() + self.options.time_limit
         fixed = self.session.settings.iterations
-        limit = fixed or self.options.iteration_limit or 100
+        limit = fixed or at_most or self.options.iteration_limit or 100
         tolerance = 0.1 * self.options.tolerance
         while self.iterations < limit:
             if time.perf_counter() > deadline:
