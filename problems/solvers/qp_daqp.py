@@ -151,7 +151,9 @@ class DAQP(Backend):
         self._hessian = self._P
         if self._weight:
             self._hessian, self._weight = positive_definite(self._P, A, self._equal)
-        self._stale = self._model.update(self._hessian, None, A[self._bounded :], None, None, self._cold) < 0
+        # the library reads the first row of what it is given, even where there is none
+        rows = A[self._bounded :] if len(A) > self._bounded else None
+        self._stale = self._model.update(self._hessian, None, rows, None, None, self._cold) < 0
 
 
 def _without_point(flag: int, iterations: int) -> QPResult:
