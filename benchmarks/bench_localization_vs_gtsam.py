@@ -34,8 +34,8 @@ def by_gtsam(team: Measurements, start: np.ndarray) -> tuple[float, np.ndarray]:
     for k, (z, heading) in enumerate(zip(team.gps, team.compass.tolist(), strict=True)):
         graph.add(gtsam.PoseTranslationPrior2D(k, z, fix))
         graph.add(gtsam.PoseRotationPrior2D(k, gtsam.Rot2(heading), compass))
-    pairs = zip(team.observer.tolist(), team.target.tolist(), team.range_bearing.tolist(), strict=True)
-    for i, j, (distance, bearing) in pairs:
+    pairs = zip(team.observer.tolist(), team.target.tolist(), team.bearing_range.tolist(), strict=True)
+    for i, j, (bearing, distance) in pairs:
         graph.add(gtsam.BearingRangeFactorPose2(i, j, gtsam.Rot2(bearing), distance, seen))
     for k, (x, y, heading) in enumerate(start.tolist()):
         values.insert(k, gtsam.Pose2(x, y, heading))

@@ -54,12 +54,10 @@ register_native(
 register_native(
     meas.bearing_range,
     (SE2, SE2),
-    lambda i, j, z, noise: gtsam.BearingRangeFactorPose2(i, j, gtsam.Rot2(z[1]), z[0], noise),
-    order=(1, 0),
+    lambda i, j, z, noise: gtsam.BearingRangeFactorPose2(i, j, gtsam.Rot2(z[0]), z[1], noise),
 )
 register_native(
     meas.bearing_range,
     (SE2, POINT2),
-    lambda i, j, z, noise: gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(z[1]), z[0], noise),
-    order=(1, 0),
+    lambda i, j, z, noise: gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(z[0]), z[1], noise),
 )

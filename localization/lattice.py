@@ -51,7 +51,7 @@ class Measurements:
         gps: (n, 2) fixes, m.
         compass: (n,) headings, rad.
         observer, target: (m,) robots; the bearing is taken in the frame of `observer`.
-        range_bearing: (m, 2) range (m) and bearing (rad) of `target`.
+        bearing_range: (m, 2) bearing (rad) and range (m) of `target`.
         sigmas: noise assumed by the estimators.
         truth: (n, 3) x (m), y (m), heading (rad), where it is known.
     """
@@ -60,7 +60,7 @@ class Measurements:
     compass: np.ndarray
     observer: np.ndarray
     target: np.ndarray
-    range_bearing: np.ndarray
+    bearing_range: np.ndarray
     sigmas: Sigmas = Sigmas()
     truth: np.ndarray | None = None
 
@@ -137,7 +137,7 @@ def measure(
     compass = angular_gaussian(truth[:, 2], sigmas.heading, rng)
     ranges = np.hypot(*away.T) + sigmas.range * rng.normal(size=len(away))
     bearings = angular_gaussian(direction, sigmas.bearing, rng)
-    seen = np.column_stack([ranges, bearings])
+    seen = np.column_stack([bearings, ranges])
     return Measurements(gps, compass, observer, target, seen, sigmas, truth)
 
 
@@ -166,15 +166,15 @@ def team_problem(
         noise=Gaussian(sigmas.heading),
     )  # fmt: skip
     problem.cost(
-        "range_bearing", meas.bearing_range_chordal if chordal else meas.bearing_range,
-        on=(robot[team.observer], robot[team.target]), data=seen, noise=Gaussian([sigmas.range, sigmas.bearing]),
+        "bearing_range", meas.bearing_range_chordal if chordal else meas.bearing_range,
+        on=(robot[team.observer], robot[team.target]), data=seen, noise=Gaussian([sigmas.bearing, sigmas.range]),
     )  # fmt: skip
     return _fenced(problem, robot, fence)
 
 
 def team_data(team: Measurements) -> dict[str, np.ndarray]:
     """Data of `team_problem`."""
-    return {"fixes": team.gps, "headings": team.compass, "seen": team.range_bearing}
+    return {"fixes": team.gps, "headings": team.compass, "seen": team.bearing_range}
 
 
 def linear_problem(team: Measurements, *, loss: Loss | None = None, fence: Fence | None = None) -> Problem:
@@ -211,8 +211,8 @@ def linear_data(team: Measurements) -> dict[str, np.ndarray]:
             f"robot(s) {_listed(blind)} measure bearings without a compass reading; the linear problem needs the "
             "heading of every observer, the nonlinear one does not"
         )
-    ranges = team.range_bearing[:, 0]
-    phi = team.range_bearing[:, 1] + team.compass[team.observer]
+    ranges = team.bearing_range[:, 1]
+    phi = team.bearing_range[:, 0] + team.compass[team.observer]
     c, s = np.cos(phi), np.sin(phi)
     displacement = ranges[:, None] * np.column_stack([c, s])
     along, across = sigmas.range**2, ranges**2 * (sigmas.bearing**2 + sigmas.heading**2)
@@ -229,7 +229,7 @@ def linear_data(team: Measurements) -> dict[str, np.ndarray]:
 def curvature_ratio(team: Measurements) -> np.ndarray:
     """How far the linear model bends each measurement (m,): r (sigma_bearing^2 + sigma_heading^2) / (2 sigma_range)."""
     sigmas = team.sigmas
-    return np.abs(team.range_bearing[:, 0]) * (sigmas.bearing**2 + sigmas.heading**2) / (2 * sigmas.range)
+    return np.abs(team.bearing_range[:, 1]) * (sigmas.bearing**2 + sigmas.heading**2) / (2 * sigmas.range)
 
 
 def require_anchored(team: Measurements) -> None:
@@ -241,7 +241,7 @@ def require_anchored(team: Measurements) -> None:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    used = ~np.isnan(team.range_bearing).any(axis=1)
+    used = ~np.isnan(team.bearing_range).any(axis=1)
     ends = (team.observer[used], team.target[used])
     graph = coo_array((np.ones(int(used.sum())), ends), shape=(team.robots, team.robots))
     groups, label = connected_components(graph, directed=False)

@@ -61,15 +61,15 @@ def bearing_chordal(pose: Any, target: Any, z: Any) -> Any:
 
 
 def bearing_range(pose: Any, target: Any, z: Any) -> Any:
-    """Range and bearing of `target` from `pose`: data (range, bearing); residual (range error, bearing error)."""
+    """Bearing and range of `target` from `pose`: data (bearing, range); residual (bearing error, range error)."""
     local = pose.transform_to(_xy(target))
-    return ca.vertcat(ca.norm_2(local) - z[0], wrap(ca.atan2(local[1], local[0]) - z[1]))
+    return ca.vertcat(wrap(ca.atan2(local[1], local[0]) - z[0]), ca.norm_2(local) - z[1])
 
 
 def bearing_range_chordal(pose: Any, target: Any, z: Any) -> Any:
     """As `bearing_range` with the chordal bearing error."""
     local = pose.transform_to(_xy(target))
-    return ca.vertcat(ca.norm_2(local) - z[0], chordal(ca.atan2(local[1], local[0]) - z[1]))
+    return ca.vertcat(chordal(ca.atan2(local[1], local[0]) - z[0]), ca.norm_2(local) - z[1])
 
 
 def relative_position(a: Any, b: Any, z: Any) -> Any:

@@ -116,10 +116,10 @@ def bearing(pose: Any, target: Any, z: Any) -> Any:
 
 
 def bearing_range(pose: Any, target: Any, z: Any) -> Any:
-    """Range and direction of `target` from `pose`: data (range, direction) (4,); residual (range error, two angles)."""
+    """Direction and range of `target` from `pose`: data (direction, range) (4,); residual (two angles, range error)."""
     local = _target(pose, target)
     length = ca.norm_2(local)
-    return ca.vertcat(length - z[0], _direction_error(local / length, z[1:4]))
+    return ca.vertcat(_direction_error(local / length, z[0:3]), length - z[3])
 
 
 def relative_pose(a: Any, b: Any, z: Any) -> Any:

@@ -96,7 +96,7 @@ def test_a_tighter_tolerance_brings_the_answer_closer() -> None:
 
 def test_methods_and_solvers_of_a_trial_meet_the_same_noise() -> None:
     one, other, next_trial = drawn()[1], drawn(tolerance=1e-3, loss="cauchy", fence=1)[1], drawn(trial=1)[1]
-    np.testing.assert_array_equal(one.team.range_bearing, other.team.range_bearing)
+    np.testing.assert_array_equal(one.team.bearing_range, other.team.bearing_range)
     np.testing.assert_array_equal(one.team.gps, other.team.gps)
     assert not np.array_equal(one.team.gps, next_trial.team.gps)
     moved = drawn(outliers=3)[1]

@@ -82,7 +82,7 @@ def test_both_robots_of_a_pair_measure() -> None:
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
     one, other = draw_lattice(9, rng(3)), draw_lattice(9, rng(3))
-    assert one.range_bearing.tobytes() == other.range_bearing.tobytes()
+    assert one.bearing_range.tobytes() == other.bearing_range.tobytes()
     assert one.compass.tobytes() == other.compass.tobytes()
 
 
@@ -387,7 +387,7 @@ def test_covariances_equal_those_of_gtsam() -> None:
         graph.add(gtsam.PoseTranslationPrior2D(k, team.gps[k], gps))
         compass = gtsam.Rot2(team.compass[k])
         graph.add(gtsam.PoseRotationPrior2D(k, compass, gtsam.noiseModel.Isotropic.Sigma(1, s.heading)))
-    for i, j, (r, b) in zip(team.observer, team.target, team.range_bearing, strict=True):
+    for i, j, (b, r) in zip(team.observer, team.target, team.bearing_range, strict=True):
         noise = diagonal(np.array([s.bearing, s.range]))
         graph.add(gtsam.BearingRangeFactorPose2(int(i), int(j), gtsam.Rot2(b), float(r), noise))
     marginals = gtsam.Marginals(graph, values)
@@ -441,12 +441,12 @@ def test_the_nonlinear_problem_keeps_the_fence_too(solver: str) -> None:
 
 def test_missing_measurements_are_left_out() -> None:
     team = draw_lattice(9, rng(8), pairs="both")
-    seen, compass = team.range_bearing.copy(), team.compass.copy()
+    seen, compass = team.bearing_range.copy(), team.compass.copy()
     seen[3] = np.nan
-    silent = replace(team, range_bearing=seen)
+    silent = replace(team, bearing_range=seen)
     keep = np.arange(len(team.observer)) != 3
     shorter = replace(
-        team, observer=team.observer[keep], target=team.target[keep], range_bearing=team.range_bearing[keep]
+        team, observer=team.observer[keep], target=team.target[keep], bearing_range=team.bearing_range[keep]
     )
     np.testing.assert_allclose(solve_ml(silent)["robot"], solve_ml(shorter)["robot"], atol=1e-7)
     compass[4] = np.nan
@@ -457,9 +457,9 @@ def test_missing_measurements_are_left_out() -> None:
 def test_groups_without_a_fix_are_named() -> None:
     team = draw_lattice(9, rng(8))
     joins = ((team.observer == 2) & (team.target == 5)) | ((team.observer == 1) & (team.target == 2))
-    seen, gps = team.range_bearing.copy(), team.gps.copy()
+    seen, gps = team.bearing_range.copy(), team.gps.copy()
     seen[joins], gps[2] = np.nan, np.nan
-    alone = replace(team, range_bearing=seen, gps=gps)
+    alone = replace(team, bearing_range=seen, gps=gps)
     with pytest.raises(UnobservableError, match=r"1 group\(s\) of robots connected by measurements: 2;"):
         require_anchored(alone)
     require_anchored(replace(alone, gps=team.gps))
@@ -475,10 +475,10 @@ def test_noise_beyond_the_linear_model_is_reported() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         linear_data(nominal)
-    seen = nominal.range_bearing.copy()
-    seen[0, 0] = -0.3
+    seen = nominal.bearing_range.copy()
+    seen[0, 1] = -0.3
     with pytest.warns(ModelWarning, match="1 range.* not positive"):
-        data = linear_data(replace(nominal, range_bearing=seen))
+        data = linear_data(replace(nominal, bearing_range=seen))
     assert np.isnan(data["displacements"][0]).all()
     assert linear_problem(nominal).compile().solve(data).solved
 

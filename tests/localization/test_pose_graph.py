@@ -261,8 +261,6 @@ def test_gauge_is_fixed_where_the_recording_says_and_only_there() -> None:
     free, initial = graph_problem(replace(g, pose_priors=prior(g, [2], rng)))
     assert "held" not in free.terms
     solution = solve(free, initial)
-    g2 = prior(g, [2], np.random.default_rng(6))
-    assert len(g2) == 1
     # one prior only places the graph: it is met exactly
     np.testing.assert_allclose(solution["pose"][2], free.inputs["pose_priors_measured"].value[0], atol=1e-9)  # type: ignore[index]
 
