@@ -25,22 +25,22 @@ IMPORT_LIMIT = 0.6  # s
 
 
 def case() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses (robots, 3), pairs (terms, 2) and measurements (terms, 2) of range and bearing."""
+    """Poses (robots, 3), pairs (terms, 2) and measurements (terms, 2) of bearing and range."""
     rng = np.random.default_rng(0)
     poses = np.column_stack([rng.uniform(0, 400, (ROBOTS, 2)), rng.uniform(-np.pi, np.pi, ROBOTS)])
     first = rng.integers(0, ROBOTS, TERMS)
     pairs = np.column_stack([first, (first + rng.integers(1, ROBOTS, TERMS)) % ROBOTS])
     d = poses[pairs[:, 1], :2] - poses[pairs[:, 0], :2]
     bearing = wrap(np.arctan2(d[:, 1], d[:, 0]) - poses[pairs[:, 0], 2])
-    return poses, pairs, np.column_stack([np.hypot(*d.T), bearing]) + 0.05 * rng.normal(size=(TERMS, 2))
+    return poses, pairs, np.column_stack([bearing, np.hypot(*d.T)]) + 0.05 * rng.normal(size=(TERMS, 2))
 
 
 def state(pairs: np.ndarray, z: np.ndarray) -> Problem:
     team = Problem("team")
     robot = team.variables("robot", SE2, ROBOTS)
-    data = team.data("range_bearing", 2, count=TERMS, value=z)
+    data = team.data("bearing_range", 2, count=TERMS, value=z)
     on = (robot[pairs[:, 0]], robot[pairs[:, 1]])
-    team.cost("seen", meas.bearing_range, on=on, data=data, noise=Gaussian(sigma=[0.1, 0.03]))
+    team.cost("seen", meas.bearing_range, on=on, data=data, noise=Gaussian(sigma=[0.03, 0.1]))
     return team
 
 
@@ -53,17 +53,17 @@ def by_hand(poses: np.ndarray, pairs: np.ndarray, z: np.ndarray) -> tuple[np.nda
     square = u * u + v * v
     distance = np.sqrt(square)
     r = np.empty((len(pairs), 2))
-    r[:, 0] = distance - z[:, 0]
-    r[:, 1] = wrap(np.arctan2(v, u) - z[:, 1])
+    r[:, 0] = wrap(np.arctan2(v, u) - z[:, 0])
+    r[:, 1] = distance - z[:, 1]
     ru, rv = u / distance, v / distance
     bu, bv = -v / square, u / square
     turn = b[:, 2] - a[:, 2]
     ct, st = np.cos(turn), np.sin(turn)
     J = np.zeros((len(pairs), 2, 6))
-    J[:, 0, 0], J[:, 0, 1] = -ru, -rv
-    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = -bu, -bv, -1.0
-    J[:, 0, 3], J[:, 0, 4] = ru * ct + rv * st, rv * ct - ru * st
-    J[:, 1, 3], J[:, 1, 4] = bu * ct + bv * st, bv * ct - bu * st
+    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2] = -bu, -bv, -1.0
+    J[:, 1, 0], J[:, 1, 1] = -ru, -rv
+    J[:, 0, 3], J[:, 0, 4] = bu * ct + bv * st, bv * ct - bu * st
+    J[:, 1, 3], J[:, 1, 4] = ru * ct + rv * st, rv * ct - ru * st
     return r, J
 
 
