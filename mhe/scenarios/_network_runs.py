@@ -166,7 +166,9 @@ class _Record:
     def _at_bound(self, estimate: Estimate) -> bool:
         if self.box is None or estimate.window is None or estimate.status is not Status.SOLVED:
             return False
-        return bool((np.abs(estimate.window) >= self.box.upper * (1 - AT_BOUND)).any())
+        slack = AT_BOUND * np.maximum(1.0, np.abs(estimate.window))
+        above, below = self.box.upper - estimate.window, estimate.window - self.box.lower
+        return bool((np.minimum(above, below) <= slack).any())
 
     def _count(self, estimate: Estimate) -> None:
         self.step_seconds.append(estimate.seconds)

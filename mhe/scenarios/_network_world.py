@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +17,7 @@ from mhe.distributed import DistributedEstimator
 from mhe.filters import KalmanFilter
 from mhe.observers import ObserverGain, place_gain
 from mhe.polyhedron import Polyhedron
-from problems.models import LinearModel, Sensor, simulate
+from problems.models import LinearModel, Sensor
 from problems.networks import Network
 
 METHODS = ("kf", "mhe", "mhe_pre", "dmhe_f", "dmhe_pre", "dmhe_w_pre")
@@ -41,7 +40,7 @@ class NetworkSettings(pydantic.BaseModel):
     )
     bounds: Literal["none", "tight", "soft"] = pydantic.Field(
         "none",
-        description="tight: states within the largest true magnitudes of the trial; soft: relaxed where infeasible",
+        description="tight: a box that the states of the trial touch; soft: relaxed where infeasible",
     )
     prior: Literal["seed", "filter", "smoothing"] = pydantic.Field("seed", description="arrival cost of mhe")
     growth_prior: Literal["consensus", "own", "mean"] = pydantic.Field(
@@ -81,9 +80,7 @@ class World:
     rows: np.ndarray
 
     @staticmethod
-    def of(
-        network: Network, outputs: Mapping[Any, np.ndarray], central: Sequence[Hashable], variance: float
-    ) -> World:
+    def of(network: Network, outputs: Mapping[Any, np.ndarray], central: Sequence[Hashable], variance: float) -> World:
         """The world of nodes with one output each, or none.
 
         Args:
@@ -119,22 +116,12 @@ class Drawn:
     Attributes:
         states: (duration + 1, 4).
         measurements: (duration + 1, p) of the sensors of all nodes.
+        box: bounds that the truth keeps and touches, so that noisy estimates are held by them.
     """
 
     states: np.ndarray
     measurements: np.ndarray
-
-    @cached_property
-    def box(self) -> Polyhedron:
-        """Largest true magnitude of every state, as bounds: the truth touches them, so estimates do."""
-        largest = np.abs(self.states).max(axis=0)
-        return Polyhedron.box(-largest, largest)
-
-
-def draw_trial(world: World, duration: int, rng: np.random.Generator, initial: np.ndarray | None = None) -> Drawn:
-    """Truth and measurements from x_0 (4,), or from an x_0 drawn from the model's prior."""
-    made = simulate(world.model, duration, rng, initial=initial)
-    return Drawn(made.states, made.measurements)
+    box: Polyhedron
 
 
 @dataclass(frozen=True)
