@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from mhe.centralized import MovingHorizonEstimator
-from mhe.distributed import DistributedEstimator, NetworkDesign, NetworkEstimate
+from mhe.distributed import DistributedEstimator, NetworkEstimate
 from mhe.estimate import Estimate, WindowEstimate
 from mhe.scenarios._network_world import METHODS, AnyEstimator, Drawn, Gains, NetworkSettings, World, make_estimator
 from problems.bench.scenario import Outcome
@@ -122,8 +122,6 @@ class NetworkScenario(ABC):
         gains = self.gains(settings, world) if method.endswith("_pre") else Gains(None, None)
         weights = self.weights(settings, world, method)
         estimator = make_estimator(world, settings, method, solver, gains, weights, box)
-        if isinstance(estimator, DistributedEstimator):
-            _compile_nodes(estimator.design)
         options = _options(estimator)
         return Prepared(estimator, time.perf_counter() - started, options)
 
@@ -186,15 +184,8 @@ class _Record:
             self.times["solve"] += estimate.seconds
 
 
-def _compile_nodes(design: NetworkDesign) -> None:
-    """Compile the windows of all nodes ahead of the first step."""
-    for node, region in enumerate(design.regional):
-        gain = None if design.gains is None else design.gains[node].gain
-        design.pool.get(region, gain, design.options, design.state_bounds, design.disturbance_bounds)
-
-
 def _options(estimator: AnyEstimator) -> dict[str, Any]:
-    """All options of a method, its gains included, with everything it needs compiled."""
+    """All options of a method, its gains and forms included; everything it needs is compiled afterwards."""
     if isinstance(estimator, MovingHorizonEstimator):
         gain = estimator.window.gain
         return dict(estimator.options) | ({} if gain is None else {"gain": gain.tolist()})
@@ -205,6 +196,11 @@ def _options(estimator: AnyEstimator) -> dict[str, Any]:
     if design.gains is not None:
         labels = design.network.labels
         options["gains"] = {str(label): gain.gain.tolist() for label, gain in zip(labels, design.gains, strict=True)}
+    for node, region in enumerate(design.regional):
+        gain = None if design.gains is None else design.gains[node].gain
+        bounds = design.state_bounds, design.disturbance_bounds
+        window, _ = design.pool.get(region, gain, design.options, *bounds)  # the node finds it there
+        options["form"] = window.form_for(design.options.solver)
     return options
 
 

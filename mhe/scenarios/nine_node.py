@@ -68,7 +68,7 @@ class NineNode(NetworkScenario):
     def draw(self, settings: Settings, rng: np.random.Generator) -> Drawn:
         initial = rng.uniform(-REACH, REACH, 4)
         made = simulate(self.world(settings).model, settings.duration, rng, initial=initial)
-        # x3 and x4 grow, so that bounds on magnitudes hold nothing until the end; x1 and x2 end at one side of their range
+        # x3 and x4 grow, so bounds on magnitudes hold nothing until the end; x1 and x2 end at one side of their range
         box = Polyhedron.box(made.states.min(axis=0), made.states.max(axis=0))
         return Drawn(made.states, made.measurements, box)
 

@@ -143,6 +143,7 @@ def test_the_arrival_cost_of_mhe_can_be_the_filter() -> None:
 
 def test_forms_apply_to_the_methods_that_have_them() -> None:
     plain = {method: run(method) for method in ("mhe", "mhe_pre", "dmhe_f", "dmhe_pre")}
+    assert [made.options["form"] for made in plain.values()] == ["F2", "P2", "F2", "P2"]
     for form in ("F1", "F3", "P1"):
         for method, reference in plain.items():
             made = run(method, form=form)
