@@ -31,6 +31,7 @@ from problems.problem import DataSlot, Problem, Slot, Variable
 
 DENSE_LIMIT = 500  # unknowns plus data; beyond, matrices are sparse
 PATTERNS = 64  # patterns of missing data whose matrices are kept
+MATRICES = 16  # sets of matrix data whose condensed programs are kept
 
 
 @dataclass(eq=False)
@@ -228,15 +229,18 @@ class QuadraticProgram:
         self.rows = AffineRows(self.layout, self.speeds, self.dense)
         self.eliminated = [_slot(entry, problem) for entry in eliminate]
         self._names = [entry.term.name for entry in self.layout.terms]
-        self._fixed: Reduced | None = None
-        self._has_matrix = "matrix" in self.speeds.values()
+        self._reduced: dict[bytes, Reduced] = {}
+        starts, inputs = self.layout.data_start, problem.inputs
+        matrix = [n for n, speed in self.speeds.items() if speed == "matrix"]
+        at = [np.arange(starts[n], starts[n] + inputs[n].rows * inputs[n].size) for n in matrix]
+        self._matrix = np.concatenate([np.zeros(0, np.intp), *at])
 
     def condense(self, eliminate: Sequence[Any]) -> QuadraticProgram:
         """The same program with further unknowns condensed away. Raises FormError."""
         return QuadraticProgram(self.problem, [*self.eliminated, *eliminate], self.dense)
 
     def __repr__(self) -> str:
-        reduced = self.reduced(DataStore(self.layout).numbers) if not self._has_matrix else None
+        reduced = None if self._matrix.size else self.reduced(DataStore(self.layout).numbers)
         shape = f", {reduced.size} unknowns, {reduced.A.shape[0]} rows" if reduced else ""
         return f"<QuadraticProgram of {self.problem.name!r}{shape}, {'dense' if self.dense else 'sparse'}>"
 
@@ -263,8 +267,15 @@ class QuadraticProgram:
 
     def reduced(self, numbers: np.ndarray) -> Reduced:
         """The program for the matrix data in `numbers`, with the chosen unknowns eliminated."""
-        if self._fixed is not None:
-            return self._fixed
+        key = numbers[self._matrix].tobytes()
+        found = self._reduced.get(key)
+        if found is None:
+            if len(self._reduced) >= MATRICES:
+                self._reduced.pop(next(iter(self._reduced)))
+            found = self._reduced[key] = self._reduce(numbers)
+        return found
+
+    def _reduce(self, numbers: np.ndarray) -> Reduced:
         rows = self.rows.evaluate(numbers)
         equal = [r for r in rows if r.layout.term.kind == "equality"]
         bounded = [r for r in rows if r.layout.term.kind == "inequality"]
@@ -281,10 +292,7 @@ class QuadraticProgram:
             map_, used = eliminate(R, E, c, columns, names)
             rest = np.setdiff1d(np.arange(R.shape[0]), used)
             R, E, c = R[rest], E[rest], c[rest]
-        out = Reduced(rows, lower, upper, map_, (R, E, c))
-        if not self._has_matrix:
-            self._fixed = out
-        return out
+        return Reduced(rows, lower, upper, map_, (R, E, c))
 
     def flags(self, numbers: np.ndarray) -> dict[str, np.ndarray | None]:
         """Active instances (count,) of each term by name; None where all are."""

@@ -6,6 +6,7 @@ backend. A solver that was named is always called.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,15 @@ from problems.solvers.qp_solution import QPCheck
 from problems.solvers.session import Session, Solution, slot_key
 
 MAPS = 64  # patterns of missing data kept between changes of weights
+KEPT_NUMBERS = 4_000_000  # of affine maps kept for weights that come back, roughly
+
+
+@dataclass(eq=False)
+class _Works:
+    """Maps and marginals by pattern, for one set of weights and matrices; shared by the forks of a session."""
+
+    maps: dict[bytes, DenseMap | SparseMap] = field(default_factory=dict)
+    marginals: dict[Any, AffineMarginal] = field(default_factory=dict)
 
 
 class QPSession(Session):
@@ -60,8 +70,11 @@ class QPSession(Session):
         self._switches = program.activity.switches.size > 0
         self._watched = self.slow | self.switching
         self._complete_key: bytes | None = None if self._switches else b""
-        self._maps: dict[bytes, DenseMap | SparseMap] = {}
-        self._marginals: dict[Any, AffineMarginal] = {}
+        self._weights = sorted(n for n in self.slow if program.problem.inputs[n].of is None)
+        numbers = max(1, program.layout.size * program.layout.data_size)
+        self._kept = max(4, min(128, KEPT_NUMBERS // numbers))
+        self._works: dict[bytes, _Works] = {}
+        self._now: _Works | None = None
         self._last_marginal: tuple[bytes, Any, Any, AffineMarginal] | None = None
         self._backend: QPBackend | None = None
         self._loaded: DenseMap | SparseMap | None = None
@@ -79,7 +92,7 @@ class QPSession(Session):
         if map_.free is not None and not self.slow:
             require_observable(self.program, map_.free)
         if not self._switches:
-            self._maps[b""] = map_
+            self._works_now().maps[b""] = map_
 
     def _set(self, name: str, value: Any) -> None:
         if name not in self._watched:
@@ -91,10 +104,21 @@ class QPSession(Session):
             self._changed(numbers=name in self.slow)
 
     def _changed(self, numbers: bool) -> None:
-        """Forget what depended on the switches and, where `numbers` changed, on weights and matrices."""
+        """Leave what depended on the switches and, where `numbers` changed, on weights and matrices."""
         self._complete_key = None if self._switches else b""
         if numbers:
-            self._maps, self._marginals, self._last_marginal = {}, {}, None
+            self._now = self._last_marginal = None
+
+    def _works_now(self) -> _Works:
+        """What is worked out for the present weights and matrices; the sets used last are kept."""
+        if self._now is None:
+            # what is missing has a key of its own, so presence flags do not count here
+            key = b"".join(self.store[name].tobytes() for name in self._weights)
+            self._now = self._works.pop(key, None) or _Works()
+            self._works[key] = self._now
+            if len(self._works) > self._kept:
+                self._works.pop(next(iter(self._works)))
+        return self._now
 
     def _update(self) -> None:
         self._map(*self._pattern())
@@ -110,11 +134,12 @@ class QPSession(Session):
         return self.program.activity.key(d), clean(d)
 
     def _map(self, pattern: bytes, numbers: np.ndarray) -> DenseMap | SparseMap:
-        map_ = self._maps.get(pattern)
+        maps = (self._now or self._works_now()).maps
+        map_ = maps.get(pattern)
         if map_ is None:
-            if len(self._maps) >= MAPS:
-                self._maps.pop(next(iter(self._maps)))
-            map_ = self._maps[pattern] = self._make(pattern, numbers, self.store)
+            if len(maps) >= MAPS:
+                maps.pop(next(iter(maps)))
+            map_ = maps[pattern] = self._make(pattern, numbers, self.store)
         return map_
 
     def _make(self, pattern: bytes, numbers: np.ndarray, store: Any) -> DenseMap | SparseMap:
@@ -151,12 +176,13 @@ class QPSession(Session):
         if last is not None and last[1] is drop and last[2] is keep and last[0] == pattern:
             return last[3](numbers, point)
         key = (pattern, slot_key(drop), slot_key(keep))
-        found = self._marginals.get(key)
+        marginals = self._works_now().marginals
+        found = marginals.get(key)
         if found is None:
-            if len(self._marginals) >= MAPS:
-                self._marginals.pop(next(iter(self._marginals)))
+            if len(marginals) >= MAPS:
+                marginals.pop(next(iter(marginals)))
             plan = self._plan(drop, keep, AffineMarginalPlan)
-            found = self._marginals[key] = AffineMarginal(plan, self.store, numbers)
+            found = marginals[key] = AffineMarginal(plan, self.store, numbers)
         self._last_marginal = (pattern, drop, keep, found)
         return found(numbers, point)
 
@@ -228,7 +254,6 @@ class QPSession(Session):
         self.last = self._backend = self._loaded = None
 
     def _forked(self) -> None:
-        self._maps, self._marginals = dict(self._maps), dict(self._marginals)
         self._backend = self._loaded = None
 
 
