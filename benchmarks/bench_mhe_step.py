@@ -1,0 +1,269 @@
+"""One step of moving horizon estimation through the public API, beside do-mpc, cvxpy and bare daqp on the same problem.
+
+4 states, 2 sensors, horizon 5, process noise, a box on all states that is active in 30 to 50 % of the steps. Every
+step gives status, residuals and multipliers, which are read. Before anything is timed, all sides find the same states
+to 1e-6. The problem is the window of the source with `prior=seed` and the constant weight Pi_0^-1, the arrival cost
+do-mpc has; do-mpc's window lacks the measurement of its first instant, so that term goes into its arrival cost.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mhe import Polyhedron, mhe
+from problems import LinearModel, Sensor, simulate
+
+N, STEPS, START, BLOCK = 5, 400, 20, 25
+TOLERANCE = 1e-8
+
+
+def example() -> tuple[LinearModel, np.ndarray, Polyhedron]:
+    """Model, measurements (steps, 2) and box."""
+    model = LinearModel(
+        [[0.99, 0.2, 0, 0], [-0.1, 0.6, 0, 0], [0, 0, 0.95, 0.2], [0, 0, -0.2, 0.9]],
+        np.diag([0.05, 0.1, 0.05, 0.1]),
+        sensors=[Sensor("first", [[1.0, 0, 0, 0]], sigma=0.5), Sensor("third", [[0, 0, 1.0, 0]], sigma=0.5)],
+        covariance=np.eye(4),
+    )
+    run = simulate(model, STEPS - 1, np.random.default_rng(0))
+    edge = np.quantile(np.abs(run.states), 0.96, axis=0)
+    return model, run.measurements, Polyhedron.box(-edge, edge)
+
+
+def our_estimator(model: LinearModel, box: Polyhedron, **options: Any) -> Any:
+    return mhe(model, N, prior="seed", arrival_covariance="constant", state_bounds=box, tolerance=TOLERANCE, **options)
+
+
+def our_step(model: LinearModel, box: Polyhedron) -> Callable[[np.ndarray], Any]:
+    """A step of ours, everything the others give read."""
+    estimator = our_estimator(model, box)
+
+    def step(y: np.ndarray) -> Any:
+        estimate = estimator.step(y)
+        solution = estimate.solution
+        return estimate.state, solution.status, solution.residuals, solution.multipliers
+
+    return step
+
+
+def windows(model: LinearModel, measurements: np.ndarray, box: Polyhedron) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Our window (N + 1, n) of every step from `START` on, the priors (n,) used, and whether a bound is active."""
+    estimator = our_estimator(model, box)
+    found, priors, active = [], [], []
+    before = None
+    for y in measurements:
+        estimate = estimator.step(y)
+        if estimate.time >= START:
+            assert before is not None and estimate.status == "solved"
+            found.append(estimate.window)
+            priors.append(before[1])
+            active.append(bool(np.abs(estimate.solution.multipliers["state bounds"]).max() > 1e-9))
+        before = estimate.window
+    return np.array(found), np.array(priors), np.array(active)
+
+
+def do_mpc_step(
+    model: LinearModel, measurements: np.ndarray, box: Polyhedron, start: np.ndarray
+) -> Callable[[int], np.ndarray]:
+    """`make_step` of do-mpc at instant t; `start` is the window (N + 1, n) found before the first of them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        do_mpc = pytest.importorskip("do_mpc")
+    import casadi as ca
+
+    plant = do_mpc.model.Model("discrete")
+    x = plant.set_variable("_x", "x", (4, 1))
+    plant.set_variable("_p", "first", (2, 1))
+    C = ca.DM(model.C)
+    plant.set_meas("y", C @ x, meas_noise=True)
+    plant.set_rhs("x", ca.DM(model.A) @ x, process_noise=True)
+    plant.setup()
+    estimator = do_mpc.estimator.MHE(plant, [])
+    estimator.settings.n_horizon, estimator.settings.t_step = N, 1.0
+    estimator.settings.meas_from_data = False
+    estimator.settings.nlpsol_opts = {
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "print_time": 0,
+        "ipopt.bound_relax_factor": 0.0,
+        "ipopt.tol": TOLERANCE,
+    }
+    W, V = (ca.DM(np.linalg.inv(matrix)) for matrix in (model.Q, model.R))
+    w, v = estimator._w, estimator._v
+    stage = w.cat.T @ W @ w.cat + v.cat.T @ V @ v.cat
+    ahead = estimator._x["x"] - estimator._x_prev["x"]
+    missed = estimator._p_set["first"] - C @ estimator._x["x"]
+    estimator.set_objective(stage, ahead.T @ ca.DM(np.linalg.inv(model.covariance)) @ ahead + missed.T @ V @ missed)
+    estimator.bounds["lower", "_x", "x"] = box.lower
+    estimator.bounds["upper", "_x", "x"] = box.upper
+    now = [0]
+    y_template, p_template = estimator.get_y_template(), estimator.get_p_template()
+
+    def recent(_: float) -> Any:
+        for k in range(N):
+            y_template["y_meas", k] = measurements[now[0] - N + 1 + k]
+        return y_template
+
+    def oldest(_: float) -> Any:
+        p_template["first"] = measurements[now[0] - N]
+        return p_template
+
+    estimator.set_y_fun(recent)
+    estimator.set_p_fun(oldest)
+    estimator.setup()
+    estimator.x0 = start[-1]
+    estimator.set_initial_guess()
+    for k in range(N + 1):
+        estimator.opt_x_num["_x", k, -1] = start[k]
+
+    def step(t: int) -> np.ndarray:
+        now[0] = t
+        state = estimator.make_step(measurements[t][:, None])
+        assert estimator.solver_stats["success"], estimator.solver_stats["return_status"]
+        assert estimator.lam_g_num.shape[0]
+        return np.ravel(state)
+
+    return step
+
+
+def cvxpy_step(model: LinearModel, box: Polyhedron, solver: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """A parametrized cvxpy problem: window (N + 1, n) from the prior (n,) and the measurements (N + 1, p)."""
+    cp = pytest.importorskip("cvxpy")
+    x, prior, y = cp.Variable((N + 1, 4)), cp.Parameter(4), cp.Parameter((N + 1, 2))
+    roots = [np.linalg.inv(np.linalg.cholesky(matrix)) for matrix in (model.covariance, model.Q, model.R)]
+    cost = cp.sum_squares(roots[0] @ (x[0] - prior))
+    cost += cp.sum_squares((x[1:] - x[:-1] @ model.A.T) @ roots[1].T)
+    cost += cp.sum_squares((y - x @ model.C.T) @ roots[2].T)
+    bounds = [x <= np.tile(box.upper, (N + 1, 1)), x >= np.tile(box.lower, (N + 1, 1))]
+    problem = cp.Problem(cp.Minimize(cost), bounds)
+    tight = {
+        "OSQP": {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000},
+        "PROXQP": {"eps_abs": 1e-8},
+        "PIQP": {"eps_abs": 1e-9, "eps_rel": 1e-9},
+    }
+
+    def step(reference: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        prior.value, y.value = reference, measured
+        problem.solve(solver=solver, warm_start=True, **tight.get(solver, {}))
+        assert problem.status == "optimal" and bounds[0].dual_value is not None
+        return x.value
+
+    return step
+
+
+def daqp_step(model: LinearModel, box: Polyhedron) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Bare ``daqp.solve`` of the same QP in the states (form F2); q is made outside of what is timed."""
+    import daqp
+
+    W, V, Pi = (np.linalg.inv(matrix) for matrix in (model.Q, model.R, model.covariance))
+    H = np.kron(np.eye(N + 1), model.C.T @ V @ model.C)
+    H[:4, :4] += Pi
+    for k in range(N):
+        move = np.zeros((4, 4 * (N + 1)))
+        move[:, 4 * k : 4 * k + 4], move[:, 4 * k + 4 : 4 * k + 8] = -model.A, np.eye(4)
+        H += move.T @ W @ move
+    upper, lower = np.tile(box.upper, N + 1), np.tile(box.lower, N + 1)
+    rows, kinds = np.zeros((0, H.shape[0])), np.zeros(upper.size, dtype=np.intc)
+
+    def step(reference: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        q = -(measured @ V @ model.C).ravel()
+        q[:4] -= Pi @ reference
+        start = time.perf_counter()
+        z = daqp.solve(H, q, rows, upper, lower, kinds)[0]
+        spent.append(time.perf_counter() - start)
+        return z.reshape(N + 1, 4)
+
+    spent: list[float] = []
+    step.spent = spent  # pyright: ignore[reportFunctionMemberAccess]
+    return step
+
+
+def summary(seconds: list[float]) -> tuple[float, float]:
+    """Median and 95 % quantile (us)."""
+    return float(np.median(seconds) * 1e6), float(np.quantile(seconds, 0.95) * 1e6)
+
+
+def test_step_beside_do_mpc_cvxpy_and_daqp(capsys: pytest.CaptureFixture[str]) -> None:
+    model, measurements, box = example()
+    found, priors, active = windows(model, measurements, box)
+    assert 0.3 <= active.mean() <= 0.5
+    instants = range(START, STEPS)
+    stacked = [measurements[t - N : t + 1] for t in instants]
+
+    cp = pytest.importorskip("cvxpy")
+    cvxpy_steps = {}
+    for solver in ("DAQP", "OSQP", "CLARABEL", "PIQP", "PROXQP", "QPOASES"):
+        if solver not in cp.installed_solvers():
+            continue
+        step = cvxpy_step(model, box, solver)
+        error = max(np.abs(step(priors[k], stacked[k]) - found[k]).max() for k in range(40))
+        if error <= 1e-6:
+            cvxpy_steps[solver] = step
+    assert cvxpy_steps
+
+    bare = daqp_step(model, box)
+    for k in range(len(found)):
+        np.testing.assert_allclose(bare(priors[k], stacked[k]), found[k], atol=1e-6)
+
+    estimator = our_estimator(model, box)
+    for y in measurements[:START]:
+        before = estimator.step(y).window
+    make_step = do_mpc_step(model, measurements, box, before)
+    for k, t in enumerate(instants[:60]):
+        np.testing.assert_allclose(make_step(t), found[k][-1], atol=1e-6)
+
+    ours = our_step(model, box)
+    for y in measurements[:START]:
+        ours(y)
+    make_step = do_mpc_step(model, measurements, box, before)
+    bare.spent.clear()  # pyright: ignore[reportFunctionMemberAccess]
+    sides: dict[str, Callable[[int], Any]] = {
+        "ours": lambda k: ours(measurements[START + k]),
+        "do-mpc": lambda k: make_step(START + k),
+        "daqp.solve": lambda k: bare(priors[k], stacked[k]),
+    }
+    for solver, step in cvxpy_steps.items():
+        sides[f"cvxpy {solver}"] = lambda k, step=step: step(priors[k], stacked[k])
+    times: dict[str, list[float]] = {name: [] for name in sides}
+    # blocks of successive steps in turn: the machine's moods meet all sides, and each runs as in a loop of its own
+    for block in range(0, 200, BLOCK):
+        for name, call in sides.items():
+            for k in range(block, block + BLOCK):
+                start = time.perf_counter()
+                call(k)
+                times[name].append(time.perf_counter() - start)
+    times["daqp.solve"] = bare.spent  # pyright: ignore[reportFunctionMemberAccess]
+
+    median = summary(times["ours"])[0]
+    mean = float(np.mean(times["ours"]) * 1e6)
+    times["ours, active"] = [taken for taken, held in zip(times["ours"], active, strict=False) if held]
+    with capsys.disabled():
+        print(f"\nbox active in {active.mean():.0%} of the steps; ours: mean {mean:.1f} us")
+        for name, seconds in times.items():
+            middle, high = summary(seconds)
+            print(f"{name:18} median {middle:9.1f} us, p95 {high:9.1f} us, {middle / median:8.1f} times ours")
+    best = min(summary(seconds)[0] for name, seconds in times.items() if name.startswith("cvxpy"))
+    assert summary(times["do-mpc"])[0] >= 100 * median
+    assert best >= 40 * median
+
+
+@pytest.mark.parametrize("form", ["F1", "F2", "F3"])
+def test_forms(form: Any, benchmark: Any) -> None:
+    """Steps of each form with the Kalman arrival cost, without reading residuals."""
+    model, measurements, box = example()
+    estimator = mhe(model, N, state_bounds=box, form=form)
+    for y in measurements:
+        estimator.step(y)
+    position = [0]
+
+    def step() -> Any:
+        position[0] = (position[0] + 1) % STEPS
+        return estimator.step(measurements[position[0]])
+
+    benchmark.pedantic(step, rounds=1000, iterations=1, warmup_rounds=50)
