@@ -4,11 +4,12 @@ from mhe.distributed.batched import BatchedNetwork, BatchEstimate, TrialInfeasib
 from mhe.distributed.design import NetworkDesign
 from mhe.distributed.network import DistributedEstimator, Infeasibility, NetworkEstimate
 from mhe.distributed.node import DistributedNode
-from mhe.distributed.options import METHODS, DistributedOptions, options_of
+from mhe.distributed.options import LITERAL, METHODS, DistributedOptions, options_of
 from mhe.distributed.plan import NodePlan
 from mhe.distributed.pool import WindowPool
 
 __all__ = [
+    "LITERAL",
     "METHODS",
     "BatchEstimate",
     "BatchedNetwork",

@@ -105,6 +105,9 @@ METHODS: dict[str, DistributedOptions] = {
     "dmhe_w_pre": DistributedOptions(disturbance="observer", weights="rank"),
 }
 
+LITERAL: dict[str, Any] = {"weight_fusion": "in_degree", "growth_prior": "own", "covariances": "online"}
+"""Overrides that give Algorithm 1 and (2.23) as printed, errata E1 and E3 undone; ``pi_update`` is so by default."""
+
 
 def options_of(method: str | DistributedOptions, **overrides: Any) -> DistributedOptions:
     """The options a method stands for, with some of them replaced.

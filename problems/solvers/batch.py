@@ -18,7 +18,6 @@ import numpy as np
 from problems.errors import DataError, ShapeError, UnknownNameError
 from problems.forms.layout import DataStore, Layout, data_rows
 from problems.forms.quadratic import clean
-from problems.problem import DataSlot
 from problems.solvers.base import Status
 from problems.solvers.qp_maps import DenseMap, SparseMap
 from problems.solvers.session import Session, Solution
@@ -181,12 +180,6 @@ class QPBatch(BatchSession):
         slow = [np.arange(self._slices[n].start, self._slices[n].stop) for n in session.slow]
         self._slow = np.concatenate([*slow, program.activity.switches]) if slow else program.activity.switches
         self._presence = {e.of.name: n for n, e in inputs.items() if e.of is not None}
-        self._may_be_infinite = {
-            value.source.name
-            for term in session.problem.terms.values()
-            for value in (term.lower, term.upper)
-            if isinstance(value, DataSlot)
-        }
         # numbers of blocks that weights and matrices came in; what is not finite, by name
         self._blocks = dict.fromkeys(self._slow_names, 1)
         self._missing: dict[str, np.ndarray] = {}
@@ -201,6 +194,7 @@ class QPBatch(BatchSession):
     def _set(self, name: str, value: Any) -> None:
         rows = self._rows(name, value)
         blocks, part = rows.shape[0], self._slices[name]
+        self._require_finite(name, rows)
         view = self.numbers[:, part].reshape(blocks, self.count // blocks, -1)
         given = rows[:, None]
         if name in self._slow_names:
@@ -219,16 +213,21 @@ class QPBatch(BatchSession):
     def _store(self, entry: int) -> DataStore:
         return self.session.store.copy(self.numbers[entry])
 
+    def _require_finite(self, name: str, rows: np.ndarray) -> None:
+        if np.vdot(rows, rows) < np.inf:  # cheap, and silent about what is not finite
+            return
+        infinite = self._slices[name].start + np.flatnonzero(np.isinf(rows).any(axis=0))
+        if np.setdiff1d(infinite, self.layout.bound_numbers).size:
+            raise DataError(f"data {name!r} have an infinite value; only bounds may be infinite")
+
     def _note_missing(self, name: str, rows: np.ndarray) -> bool:
         """Keep track of numbers that are not finite; whether the pattern of missing ones changed."""
         known = self._missing.pop(name, None)
         self._infinite.discard(name)
-        if np.isfinite(rows.sum()):
+        if np.vdot(rows, rows) < np.inf:
             return known is not None
         missing = np.isnan(rows)
         if np.isinf(rows).any():
-            if name not in self._may_be_infinite:
-                raise DataError(f"data {name!r} have an infinite value")
             self._infinite.add(name)
         if not missing.any():
             return known is not None
@@ -272,11 +271,11 @@ class QPBatch(BatchSession):
             parts = self._parts()
             while len(self._forks) < len(parts):
                 self._forks.append(self.session.fork())
-            self._groups = []
+            groups = []
             for entries, fork in zip(parts, self._forks, strict=False):
                 fork.adopt(self.numbers[entries[0]])
-                self._groups.append(Group(entries, fork, fork.current_map()))
-            self._stacked = StackedMaps.of(self._groups)
+                groups.append(Group(entries, fork, fork.current_map()))
+            self._groups, self._stacked = groups, StackedMaps.of(groups)
         return self._groups
 
     def _parts(self) -> list[np.ndarray]:

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from mhe.distributed import METHODS, DistributedOptions, NetworkDesign, WindowPool, options_of
+from mhe.distributed import LITERAL, METHODS, DistributedOptions, NetworkDesign, WindowPool, options_of
 from mhe.observers import place_gain
 from mhe.polyhedron import Polyhedron
 from problems.errors import (
@@ -30,6 +30,9 @@ FIRST, THIRD = [[1.0, 0, 0, 0]], [[0, 0, 1.0, 0]]
 K = np.array([[0.5, 0, 0, 0.5], [0.5, 0.5, 0, 0], [0, 0.5, 0.5, 0], [0, 0, 0.5, 0.5]])
 RING = ring(4, directed=True)
 CYCLE = [(1, 2), (2, 3), (3, 4), (4, 9), (9, 8), (8, 7), (7, 5), (5, 6), (6, 1)]
+
+# every test that is about warnings asks for its own
+pytestmark = pytest.mark.filterwarnings("ignore::problems.errors.ModelWarning")
 
 
 def four_states(outputs: list[list[list[float]]] | None = None) -> LinearModel:
@@ -54,7 +57,8 @@ def test_a_method_is_one_set_of_options_and_each_can_be_replaced() -> None:
     assert (options_of("dmhe_f").disturbance, options_of("dmhe_f").weights) == ("process_noise", "uniform")
     assert (options_of("dmhe_pre").disturbance, options_of("dmhe_pre").weights) == ("observer", "uniform")
     assert (options_of("dmhe_w_pre").disturbance, options_of("dmhe_w_pre").weights) == ("observer", "rank")
-    literal = options_of("dmhe_pre", weight_fusion="in_degree", growth_prior="own", covariances="online")
+    literal = options_of("dmhe_pre", **LITERAL)
+    assert (literal.weight_fusion, literal.growth_prior, literal.pi_update) == ("in_degree", "own", "seed")
     assert options_of(literal, horizon=3).as_dict() == literal.as_dict() | {"horizon": 3}
     assert literal.as_dict() == DistributedOptions(**literal.as_dict()).as_dict()
 

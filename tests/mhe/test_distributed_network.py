@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mhe.distributed import DistributedEstimator, NetworkDesign
+from mhe.distributed import node as node_module
 from mhe.distributed.node import DistributedNode
 from mhe.observers import ObserverGain, place_gain
 from mhe.polyhedron import Polyhedron
@@ -293,27 +294,53 @@ def test_losses_delays_and_outages_leave_the_estimates_usable() -> None:
             assert errors["loss"] != errors["none"] and errors["late"] != errors["none"]
 
 
-def test_a_missing_neighbour_is_propagated_inflated_and_renormalised() -> None:
-    """One lost message, against the arrival cost written out."""
-    model = four_states()
-    trial = simulate(model, 12, np.random.default_rng(9))
-    estimator = DistributedEstimator(model, RING, **ring_options("dmhe_f", horizon=3))
+@pytest.mark.parametrize("covariances", ["offline", "online"])
+@pytest.mark.parametrize("fusion", ["out_degree", "convex"])
+@pytest.mark.parametrize("forget_after", [None, 1])
+def test_a_missing_neighbour_is_propagated_inflated_and_renormalised(
+    covariances: str, fusion: str, forget_after: int | None
+) -> None:
+    """Two lost messages, against the arrival cost written out."""
+    model = four_states(inputs=True)
+    trial = simulate(model, 12, np.random.default_rng(9), inputs=np.ones((12, 1)))
+    inputs = np.random.default_rng(10).normal(size=(9, 1))
+    options = ring_options(
+        "dmhe_f", horizon=3, weight_fusion=fusion, forget_after=forget_after, covariances=covariances
+    )
+    estimator = DistributedEstimator(model, RING, **options)
     node = DistributedNode(estimator.design.plans[0])
     sender = DistributedNode(estimator.design.plans[3])
-    for t in range(8):
-        (said,) = sender.measure(float(t), trial.measurements[t, 3:4])
+    for t in range(9):
+        (said,) = sender.measure(float(t), (trial.measurements[t, 3:4], inputs[t]))
         sender.finish([])
-        node.measure(float(t), trial.measurements[t, :1])
-        inbox = [Message(said.schema, 3, t, float(t), 0, said.payload)] if t < 7 else []
-        if t == 7:
-            own, heard = node._published, node._memory._known[3][1]
-        estimate = node.finish(inbox)
+        (spoken,) = node.measure(float(t), (trial.measurements[t, :1], inputs[t]))
+        estimate = node.finish([Message(said.schema, 3, t, float(t), 0, said.payload)] if t < 7 else [])
+        if t == 6:
+            heard, theirs = unpacked(said)
     assert estimate.missing == (1,)
+    own, mine = unpacked(spoken)
+    if covariances == "offline":
+        mine, theirs = estimator.design.covariances().local[8 - 4, [0, 3]]
+    # sent at t = 6 about instant 3; the window of t = 8 begins at instant 5
+    for k in (4, 5):
+        heard = A @ heard + B @ inputs[k]
     reference = node._session.store["reference"][0]
-    np.testing.assert_allclose(reference, 0.5 * own + 0.5 * A @ heard, rtol=1e-12)
-    local = estimator.design.covariances().local[7 - 4]
-    fused = 2 * 0.25 * (local[0] + local[3] + Q)
-    np.testing.assert_allclose(np.linalg.inv(node._session.store["information"].reshape(4, 4)), fused, rtol=1e-9)
+    fused = np.linalg.inv(node._session.store["information"].reshape(4, 4))
+    if forget_after is None:
+        np.testing.assert_allclose(reference, 0.5 * own + 0.5 * heard, rtol=1e-12)
+        np.testing.assert_allclose(fused, 0.5 * (mine + theirs + 2 * Q), rtol=1e-9)
+    else:
+        np.testing.assert_allclose(reference, own, rtol=1e-12)
+        # all weight is its own, and d_j = 2 nodes hear it
+        np.testing.assert_allclose(fused, (2.0 if fusion == "out_degree" else 1.0) * mine, rtol=1e-9)
+
+
+def unpacked(said: Any) -> tuple[np.ndarray, np.ndarray]:
+    """State and covariance (zero where it does not travel) of a message with one measurement."""
+    numbers, covariance = np.frombuffer(said.payload), np.zeros((4, 4))
+    if numbers.size > 5:
+        covariance[np.triu_indices(4)] = numbers[5:]
+    return numbers[1:5], covariance + np.triu(covariance, 1).T
 
 
 def test_late_measurements_fill_their_own_slot() -> None:
@@ -336,6 +363,8 @@ def test_steps_in_steady_state_pass_no_matrices_and_build_no_maps(monkeypatch: p
             run(estimator, trial.measurements[:150])
             with monkeypatch.context() as patch:
                 patch.delattr(qp_session, "DenseMap")
+                for name in ("inverse", "arrival_update", "capped", "symmetrized"):
+                    patch.delattr(node_module, name)
                 run(estimator, trial.measurements[150:])
 
 
