@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from problems.bench.export import by_scenario, columns, number, percent, seconds
 from problems.bench.metrics import solved_share
 from problems.bench.rows import Job, Row
+from problems.bench.scenario import TIMES
 from problems.bench.settings import as_text
-from problems.bench.summary import Summary, configuration, reproduce
+from problems.bench.summary import STEP_TIMES, Summary, configuration, reproduce
 from problems.errors import ReadError
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     for name, rows in by_scenario(summaries).items():
         settings, metrics = columns(rows)
         head = ["method", "solver", *settings]
-        numeric = [*metrics, "step (median)", "step (p95)", "solve", "solved", "failed trials"]
+        numeric = [*metrics, "step (median)", "step (p95)", *TIMES, "solved", "failed trials"]
         made = table(f"{name}, {_counted(rows)}", [*head, *numeric], numeric)
         for row in rows:
             made.add_row(
@@ -92,7 +93,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
                 row.solver,
                 *(as_text(row.settings.get(key)) for key in settings),
                 *(number(row.metrics.get(key), row.metrics_se.get(key)) for key in metrics),
-                *(seconds(row.time[key]) for key in ("step_median", "step_p95", "solve")),
+                *(seconds(row.time[key]) for key in (*STEP_TIMES, *TIMES)),
                 percent(solved_share(row.status)),
                 str(row.failed),
             )
