@@ -19,6 +19,8 @@ from problems.bench.summary import Summary, configuration, reproduce, summarize
 
 COMPARISONS_SHOWN = 200
 
+DISTANCE = "distance_to_reference"
+
 
 def page(results: Results) -> str:
     """The report as HTML; it needs no network and no other file.
@@ -76,11 +78,16 @@ def _scenario(prefix: str, name: str, summaries: Sequence[Summary], rows: Sequen
     main = [metric for metric in facts["metrics"] if metric in metrics]
     shown = [*main, *(metric for metric in metrics if metric not in main)]
     parts = [f"<h2>{escape(name)}</h2>", f'<p class="muted">{escape(facts["source"])}</p>']
-    pictures = [_accuracy(f"{prefix}m{place}", metric, summaries, settings) for place, metric in enumerate(shown)]
+    # where tolerances are swept, what they buy is the distance to the optimum: that curve comes first
+    swept = DISTANCE in shown and "tolerance" in settings
+    drawn = [DISTANCE, *(metric for metric in shown if metric != DISTANCE)] if swept else shown
+    pictures = [_accuracy(f"{prefix}m{place}", metric, summaries, settings) for place, metric in enumerate(drawn)]
     pictures = [each for each in pictures if each]
-    parts += pictures[:1]
-    if pictures[1:]:
-        parts.append(f"<details><summary>The other metrics against time</summary>{''.join(pictures[1:])}</details>")
+    open_ones = 2 if swept else 1
+    parts += pictures[:open_ones]
+    if pictures[open_ones:]:
+        rest = "".join(pictures[open_ones:])
+        parts.append(f"<details><summary>The other metrics against time</summary>{rest}</details>")
     parts.append(_results(name, summaries, settings, shown, results.scenarios))
     limit = results.plan["time_limit"]
     parts += [_solver_times(rows, limit), _profile(rows)]
