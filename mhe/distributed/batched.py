@@ -141,7 +141,7 @@ class BatchedNetwork:
             raise ShapeError(f"measurements: expected shape {self._y.shape[1:]}, got {y.shape}")
         if np.isinf(y).any():
             raise DataError(f"measurements: an infinite value at time step {self._instant + 1}; a missing one is NaN")
-        self._advance(y, inputs)
+        self._advance(y, self._input(inputs))
         count, newest = self.design.network.count, self._newest
         status = np.full((count, self.trials), Status.SOLVED, dtype=object)
         infeasible: list[TrialInfeasibility] = []
@@ -159,8 +159,18 @@ class BatchedNetwork:
             instant=self._instant,
         )
 
-    def _advance(self, y: np.ndarray, inputs: Any) -> None:
-        m = self.design.model.input_size
+    def _input(self, inputs: Any) -> np.ndarray:
+        m, instant = self.design.model.input_size, self._instant + 1
+        if inputs is None and (not m or not instant):
+            return np.zeros(m)
+        if inputs is None:
+            raise DataError(f"inputs: the model needs {m} input(s) at time step {instant}")
+        u = np.asarray(inputs, dtype=float)
+        if u.shape not in ((m,), (self.trials, m)) or not np.isfinite(u).all():
+            raise DataError(f"inputs: expected {m} finite number(s), or one row per trial, got shape {u.shape}")
+        return u
+
+    def _advance(self, y: np.ndarray, u: np.ndarray) -> None:
         self._instant += 1
         self._slid = self._instant > self._horizon
         self._newest = min(self._instant, self._horizon)
@@ -168,15 +178,6 @@ class BatchedNetwork:
             self._y[:-1] = self._y[1:]
             self._u[:, :-1] = self._u[:, 1:]
         self._y[self._newest] = y
-        if not m:
-            return
-        if inputs is None:
-            if self._instant:
-                raise DataError(f"inputs: the model needs {m} input(s) at time step {self._instant}")
-            return
-        u = np.asarray(inputs, dtype=float)
-        if u.shape not in ((m,), (self.trials, m)) or not np.isfinite(u).all():
-            raise DataError(f"inputs: expected {m} finite number(s), or one row per trial, got shape {u.shape}")
         self._u[:, self._newest] = u
 
     def _reference(self) -> np.ndarray:
@@ -205,7 +206,7 @@ class BatchedNetwork:
         data.update(self._information(group))
         if self._u.shape[2]:
             data["u"] = np.tile(self._u, (len(nodes), 1, 1))
-        if group.window.bounds and not (self._slid and self._instant > self._horizon + 1):
+        if group.window.bounds and not self._slid:
             data["filled"] = (np.arange(self._horizon + 1) <= self._newest).astype(float)
         solution = batch.solve(data)
         shape = (len(nodes), self.trials)
