@@ -150,7 +150,6 @@ class MovingHorizonEstimator:
         states = np.tile(self._mean[:n], (self.window.horizon + 1, 1))
         self._now = WindowState(states, parameters, slots.measurements, slots.inputs, self.session)
         self._before = states
-        self._w: np.ndarray | None = None
         self._ready: tuple[np.ndarray, np.ndarray | None] | None = None
         self._data: dict[str, Any] = {"y": slots.column, **self._arrival.start()}
         if self._given is not None:
@@ -280,8 +279,6 @@ class MovingHorizonEstimator:
         if status in _SOLVED or status in _STOPPED:
             self._take(solution)
             self._now.located = True
-            if self.window.w is not None:
-                self._w = solution["w"]
         self._now.solution = solution
         return status, solution
 
@@ -315,12 +312,10 @@ class MovingHorizonEstimator:
         self.session.prepare(self._values(guess))
 
     def _values(self, guess: np.ndarray) -> dict[str, Any]:
-        """Values of all variables to start from."""
+        """Values to start from; everything else enters linearly."""
         values: dict[str, Any] = {"x": guess}
         if self.window.parameters is not None:
             values["parameters"] = self._now.parameters
-        if self._w is not None:
-            values["w"] = np.vstack([self._w[1:], 0 * self._w[:1]]) if self._slots.slid else self._w
         return values
 
     def _guess(self) -> np.ndarray:

@@ -94,11 +94,20 @@ class TestProtocol:
         )
         assert states(first).tobytes() == states(again).tobytes() == states(other).tobytes()
 
-    def test_results_do_not_share_memory_with_the_estimator(self):
+    def test_reset_forgets_the_start_of_a_solver(self):
+        model = ring()
+        run = simulate(model, 25, np.random.default_rng(3))
+        options = {"solver": "osqp", "state_bounds": Polyhedron.box([-1.0] * 4, [1.0] * 4), "tolerance": 1e-4}
+        estimator = mhe(model, 4, **options)
+        first, again = replay(estimator, run), (estimator.reset(), replay(estimator, run))[1]
+        assert states(first).tobytes() == states(again).tobytes()
+
+    @pytest.mark.parametrize("horizon", [1, 3])
+    def test_results_do_not_share_memory_with_the_estimator(self, horizon):
         model = ring()
         run = simulate(model, 12, np.random.default_rng(0))
-        expected = states(replay(mhe(model, 3, prior="seed"), run))
-        estimator, found = mhe(model, 3, prior="seed"), []
+        expected = states(replay(mhe(model, horizon, prior="seed"), run))
+        estimator, found = mhe(model, horizon, prior="seed"), []
         for y in run.measurements:
             given = y.copy()
             estimate = estimator.step(given)
