@@ -1,8 +1,8 @@
 """Measurement templates: residuals of position, heading, range, bearing, relative pose and odometry, in symbols.
 
 Every function is the residual of a cost: it takes the elements of its slots, then its data, and returns the residual to
-be whitened. Angles come in two forms that agree to third order (spec ``gps-range-bearing-localization`` 3.5): *geodesic*
-residuals are the wrapped angle (what gtsam uses), *chordal* ones ``2 sin(e/2)`` (the von Mises likelihood).
+be whitened. Angles come in two forms that agree to third order (spec ``gps-range-bearing-localization`` 3.5): a
+*geodesic* residual is the wrapped angle (what gtsam uses), a *chordal* one ``2 sin(e/2)`` (the von Mises likelihood).
 Units: metres and radians.
 """
 

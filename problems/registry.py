@@ -6,7 +6,7 @@ declaring an entry point in the group ``horizonet.<kind>``; nothing of this pack
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -15,7 +15,7 @@ from problems.errors import MissingExtraError, SettingError, UnknownNameError
 KINDS = ("solvers", "estimators", "scenarios", "readers", "commands", "native_factors")
 
 
-@lru_cache(maxsize=None)
+@cache
 def _entries(kind: str) -> dict[str, EntryPoint]:
     if kind not in KINDS:
         raise SettingError(f"no registry {kind!r}; registries: {', '.join(KINDS)}")

@@ -19,9 +19,8 @@ from problems.errors import DataError, DefinitionError
 
 def wrap(angle: Any) -> Any:
     """Angle in (-pi, pi], for floats, arrays and CasADi expressions (radians)."""
-    if isinstance(angle, (ca.SX, ca.MX, ca.DM)):
-        return angle - 2 * math.pi * ca.ceil((angle - math.pi) / (2 * math.pi))
-    return angle - 2 * math.pi * np.ceil((angle - math.pi) / (2 * math.pi))
+    ceil: Any = ca.ceil if isinstance(angle, (ca.SX, ca.MX, ca.DM)) else np.ceil
+    return angle - 2 * math.pi * ceil((angle - math.pi) / (2 * math.pi))
 
 
 @runtime_checkable

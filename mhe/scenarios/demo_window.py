@@ -67,7 +67,7 @@ class Drawn:
         """States (duration + 1, 3) at the optima of the same windows, solved much more tightly."""
         if method not in self._references:
             exact = settings.model_copy(update={"tolerance": REFERENCE_TOLERANCE, "form": "auto", "warm": True})
-            estimator = _estimator(exact, method, "daqp")
+            estimator = _estimator(exact, method, "daqp")  # type: ignore[arg-type]
             estimator.reset()
             self._references[method] = np.array([estimator.step(y).state for y in self.measurements])
         return self._references[method]
@@ -106,7 +106,7 @@ class DemoWindowScenario:
             return _filtered(drawn)
         started = perf_counter()
         # trials differ in data only, so they share everything compiled
-        estimator = _estimator(settings, method, solver)
+        estimator = _estimator(settings, method, solver)  # type: ignore[arg-type]
         compiled = perf_counter() - started
         estimator.reset()
         estimates = [estimator.step(y) for y in drawn.measurements]

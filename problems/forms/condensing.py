@@ -80,15 +80,17 @@ def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: s
         Z[columns], Y[columns] = solved[0], solved[1]
     else:
         try:
-            factor = spla.splu(sp.csc_matrix(block))
+            factor: Any = spla.splu(sp.csc_matrix(block))
         except RuntimeError as error:
             raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)") from error
-        inverse = spla.LinearOperator(block.shape, factor.solve, lambda v: factor.solve(v, "T"))
-        if not spla.onenormest(inverse) * spla.norm(block, 1) < SINGULAR:
+        linear_operator: Any = spla.LinearOperator
+        inverse = linear_operator(block.shape, factor.solve, lambda v: factor.solve(v, "T"))
+        size_of_inverse: Any = spla.onenormest(inverse)
+        if not size_of_inverse * spla.norm(block, 1) < SINGULAR:
             raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)")
         solved = [-factor.solve(b.toarray() if sp.issparse(b) else b) for b in right]
-        place = sp.csr_array((np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size))
-        stay = sp.csr_array((np.ones(kept.size), (kept, np.arange(kept.size))), shape=(size, kept.size))
+        place: Any = sp.csr_array((np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size))
+        stay: Any = sp.csr_array((np.ones(kept.size), (kept, np.arange(kept.size))), shape=(size, kept.size))
         Z = (stay + place @ sp.csr_array(solved[0])).tocsr()
         Y = (place @ sp.csr_array(solved[1])).tocsr()
     z0 = np.zeros(size)
@@ -108,7 +110,8 @@ def _determining(block: Matrix, names: str) -> np.ndarray:
     """As many rows of `block` as it has columns, chosen so that they determine the columns."""
     wide = block.shape[1]
     if isinstance(block, np.ndarray):
-        return np.sort(la.qr(block.T, mode="r", pivoting=True)[1][:wide])
+        _, pivots = la.qr(block.T, mode="r", pivoting=True)  # type: ignore[misc]
+        return np.sort(pivots[:wide])
     # the matching with the largest product of entries
     cost = sp.csr_array(block)
     cost.data = 1.0 + np.log(np.abs(cost.data).max()) - np.log(np.abs(cost.data))

@@ -365,7 +365,7 @@ class Activity:
         out: list[np.ndarray | None] = []
         missing = np.isnan(numbers)
         for (entry, index, switch), constant in zip(self._terms, self.constant, strict=True):
-            on = ~missing[index].any(axis=1)
+            on: Any = ~missing[index].any(axis=1)
             if entry.term.kind == "equality":
                 if not on.all():
                     raise DataError(

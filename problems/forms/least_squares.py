@@ -192,10 +192,11 @@ class _Whole:
         for (buffer, _), results in zip(
             self._buffers, ([self._value], [self._cost, self._gradient, self._hessian]), strict=True
         ):
-            buffer.set_arg(0, memoryview(self._x))
-            buffer.set_arg(1, memoryview(self._p))
+            access: Any = buffer  # its stubs know only calls with a size
+            access.set_arg(0, self._x.data)
+            access.set_arg(1, self._p.data)
             for k, result in enumerate(results):
-                buffer.set_res(k, memoryview(result))
+                access.set_res(k, result.data)
 
     def value(self, point: np.ndarray, parameters: np.ndarray) -> float:
         self._x[:] = point
@@ -230,7 +231,7 @@ def _whole_function(form: LeastSquares) -> _Whole:
         switches.append(on)
         positions, twice = pattern.positions[k]
         for i in range(term.count):
-            inputs = [x[entry.stored[i].tolist()]]
+            inputs: list[Any] = [x[entry.stored[i].tolist()]]
             if entry.numbers.shape[1]:
                 inputs.append(numbers[entry.numbers[i].tolist()])
             if cost.fixed_whitening is None:

@@ -98,11 +98,11 @@ def is_affine(problem: Problem) -> bool:
 
 def options_of(settings: Mapping[str, Any]) -> Options:
     """Settings as `Options`; what is not common to all solvers is the solver's own. Raises SettingError."""
-    common = {k: settings[k] for k in ("tolerance", "time_limit", "iteration_limit") if k in settings}
+    common: dict[str, Any] = {k: settings[k] for k in ("tolerance", "time_limit", "iteration_limit") if k in settings}
     for name, value in common.items():
-        number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
         if value is None and name == "iteration_limit":
             continue
-        if not number or not value > 0:
+        number: Any = value if isinstance(value, (int, float, np.number)) and not isinstance(value, bool) else 0
+        if not number > 0:
             raise SettingError(f"{name} must be a positive number, got {value!r}")
     return Options(**common, extra={k: v for k, v in settings.items() if k not in common})

@@ -61,6 +61,7 @@ def covariance_blocks(layout: Layout, hessian: Any, equalities: Any, columns: np
     """
     solve, free = factorized_kkt(hessian, equalities)
     if solve is None:
+        assert free is not None
         raise UnobservableError(
             f"no covariance: the costs leave {layout.names_of(free)} free; add a prior or fix the gauge"
         )

@@ -182,8 +182,8 @@ class Session(ABC):
 
     def fork(self) -> Session:
         """A session with its own data and warm start that shares everything compiled."""
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__)
+        other: Any = object.__new__(type(self))
+        vars(other).update(vars(self))
         other.store = self.store.copy()
         other._point = None if self._point is None else self._point.copy()
         other._forked()
