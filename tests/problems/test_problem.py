@@ -405,6 +405,19 @@ def test_presence_lets_an_equality_say_what_holds_without_data(solver: str) -> N
         np.testing.assert_allclose(got["w"].ravel(), np.where(there, np.nan_to_num(y) - x, 0.0), atol=1e-8)
 
 
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_an_equality_that_fixes_a_variable_only_where_its_datum_is_there(solver: str) -> None:
+    p = Problem()
+    x, y = p.variables("x", Vector(1), 2), p.data("y", 1, 2)
+    p.cost("level", lambda x: x - 1, on=x)
+    p.equality("seen", lambda x, y, there: there * (x - y), on=x, data=(y, p.presence(y)))
+    session = p.compile(solver)
+    for y, want in (([3.0, np.nan], [3.0, 1.0]), ([np.nan, np.nan], [1.0, 1.0]), ([3.0, 4.0], [3.0, 4.0])):
+        got = session.solve({"y": y})
+        assert got.solved
+        np.testing.assert_allclose(got["x"].ravel(), want, atol=1e-8)
+
+
 def test_presence_of_a_default_with_missing_rows() -> None:
     got = observer(True, [[3.0], [np.nan], [1.0]]).compile().solve()
     np.testing.assert_allclose(got["x"].ravel(), [2.0, 1.0, 1.0])
