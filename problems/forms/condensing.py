@@ -89,7 +89,9 @@ def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: s
         if not size_of_inverse * spla.norm(block, 1) < SINGULAR:
             raise FormError(f"cannot eliminate {names}: the equalities do not determine them (singular)")
         solved = [-factor.solve(b.toarray() if sp.issparse(b) else b) for b in right]
-        place: Any = sp.csr_array((np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size))
+        place: Any = sp.csr_array(
+            (np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size)
+        )
         stay: Any = sp.csr_array((np.ones(kept.size), (kept, np.arange(kept.size))), shape=(size, kept.size))
         Z = (stay + place @ sp.csr_array(solved[0])).tocsr()
         Y = (place @ sp.csr_array(solved[1])).tocsr()
