@@ -77,9 +77,7 @@ class QPBackend(Protocol):
     warm_starts: ClassVar[bool]
     extra: ClassVar[str | None]
 
-    def __init__(
-        self, P: Any, q: np.ndarray, A: Any, l: np.ndarray, u: np.ndarray, options: Options
-    ) -> None: ...
+    def __init__(self, P: Any, q: np.ndarray, A: Any, l: np.ndarray, u: np.ndarray, options: Options) -> None: ...
 
     def solve(
         self, q: np.ndarray, l: np.ndarray, u: np.ndarray, warm: tuple[np.ndarray, np.ndarray] | None = None
