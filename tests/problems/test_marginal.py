@@ -339,6 +339,19 @@ def test_a_dropped_variable_that_nothing_determines_is_named(solver: str) -> Non
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
+def test_rounding_does_not_make_a_dropped_variable_determined(solver: str) -> None:
+    p = Problem()
+    x = p.variables("x", Vector(2), 2)
+    p.cost("see", lambda a, b: ca.vertcat(0.1 * a[0] + 0.3 * a[1], 0.7 * a[0] + 2.1 * a[1]) - b, on=(x[0], x[1]))
+    p.cost("more", lambda a: 1.1 * a[0] + 3.3 * a[1], on=x[0])
+    p.cost("hold", lambda a: a, on=x[1])
+    p.inequality("box", lambda x: x, on=x[0], lower=-1.0, upper=1.0)
+    p.cost("linear", lambda x: x[0], on=x[0], noise=Gaussian(information=0.0), linear=1.0)
+    with pytest.raises(UnobservableError, match="marginal: the costs leave a dropped variable free"):
+        p.compile(solver).marginal(x[0], at={"x": np.zeros((2, 2))})
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_marginals_follow_weights_and_data(solver: str) -> None:
     p = Problem()
     x, z, W = p.variables("x", Vector(1), 2), p.data("z"), p.data("W", (1, 1), value=[[1.0]])

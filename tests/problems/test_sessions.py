@@ -233,6 +233,21 @@ def test_all_solvers_agree(solver: str) -> None:
             np.testing.assert_allclose(b.multipliers[name], y, atol=1e-5 * max(1.0, np.abs(y).max()))
 
 
+@pytest.mark.parametrize("solver", ["auto", "daqp", "gauss-newton"])
+def test_equalities_may_come_and_go_with_the_data_under_active_rows(solver: str) -> None:
+    p = Problem()
+    x, y = p.variables("x", Vector(1), 3), p.data("y", 1, 3)
+    p.cost("level", lambda x: x - 1, on=x)
+    p.equality("seen", lambda x, y, there: there * (x - y), on=x, data=(y, p.presence(y)))
+    p.inequality("top", lambda x: x, on=x, upper=0.5)
+    session = p.compile(solver)
+    for y in ([0.0, np.nan, 0.2], [np.nan] * 3, [0.1, 0.2, np.nan], [0.0, 0.1, 0.2], [0.3, np.nan, np.nan]):
+        got = session.solve({"y": y})
+        assert got.solved
+        np.testing.assert_allclose(got["x"].ravel(), np.where(np.isnan(y), 0.5, y), atol=1e-7)
+    assert session.solve({"y": [0.0, 0.7, 0.2]}).status is Status.INFEASIBLE
+
+
 def test_auto_answers_linearly_until_a_row_is_violated_and_a_named_solver_is_always_called() -> None:
     p = window()
     auto, named = p.compile(), p.compile("daqp")
@@ -610,6 +625,18 @@ def test_preparation_and_feedback_are_one_gauss_newton_step() -> None:
     once = p.compile("gauss-newton", iterations=1).solve(data, initial)
     np.testing.assert_allclose(once.point, got.point, atol=1e-9)
     assert session.solve().iterations > 1  # the preparation is used up
+
+
+def test_feedback_leaves_pinned_instances_where_they_are() -> None:
+    p, robot, _ = team()
+    p.equality("start", lambda T: T.coordinates, on=robot[1])
+    data, initial = team_data()
+    session = p.compile("gauss-newton")
+    session.update(**data)
+    session.prepare(initial)
+    got = session.solve()
+    np.testing.assert_allclose(got["robot"][1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(got.point, p.compile("gauss-newton", iterations=1).solve(data, initial).point, atol=1e-9)
 
 
 def test_feedback_respects_constraints() -> None:
