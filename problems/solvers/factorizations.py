@@ -23,7 +23,7 @@ from problems.forms.sparsity import HessianPattern
 
 DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
 BLOCK_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
-PARDISO_WORK = 5e7  # the same for Pardiso with its analysis, at five factorizations per solve
+HEAVY_WORK = 5e7  # the same for Pardiso with its analysis, at five factorizations per solve
 
 LinearSolver = Literal["auto", "dense", "qdldl", "superlu", "pardiso", "cholmod"]
 
@@ -229,7 +229,7 @@ def factorization(pattern: HessianPattern, solver: LinearSolver = "auto") -> Fac
     if solver == "auto":
         if pattern.size <= DENSE_SIZE:
             solver = "dense"
-        elif pattern.work >= PARDISO_WORK and find_spec("pypardiso") is not None:
+        elif pattern.work >= HEAVY_WORK and find_spec("pypardiso") is not None:
             solver = "pardiso"
         else:
             solver = "superlu" if pattern.work >= BLOCK_WORK else "qdldl"

@@ -1,8 +1,10 @@
 """Our own solver for nonlinear least squares on manifolds: damped Gauss-Newton, inequalities by SQP.
 
 Steps are computed from ``(H + lambda D) dx = -g`` with D the diagonal of H; lambda is zero until a step fails to reduce
-the cost (Levenberg-Marquardt, Marquardt 1963; Nocedal and Wright, ch. 10). Constraints are linearized in the tangent
-of the iterate and the step becomes a QP; steps are accepted on an l1 merit function (Nocedal and Wright, ch. 18).
+the cost (Levenberg-Marquardt, Marquardt 1963; Nocedal and Wright, ch. 10). Near the end the last factorization is tried
+again: it shows convergence, and where factorizations dominate its steps are good enough. Constraints are linearized in
+the tangent of the iterate and the step becomes a QP; steps are accepted on an l1 merit function (Nocedal and Wright,
+ch. 18).
 """
 
 from __future__ import annotations
@@ -21,7 +23,13 @@ from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.problem import Problem
 from problems.solvers.base import Options, Status
-from problems.solvers.factorizations import LinearSolver, SingularError, factorization
+from problems.solvers.factorizations import (
+    DENSE_SIZE,
+    HEAVY_WORK,
+    LinearSolver,
+    SingularError,
+    factorization,
+)
 from problems.solvers.least_squares_solution import LeastSquaresCheck
 from problems.solvers.optimality import optimality
 from problems.solvers.qp_step import QPStep
@@ -31,6 +39,8 @@ from problems.solvers.settings import own_version
 
 DAMPING_START = 1e-6
 DAMPING_LIMIT = 1e12
+NEAR = 1e-2  # share of the cost below which a decrease says that the matrix hardly changes any more
+CONTRACTION = 0.1  # share of the last decrease below which a step with the kept matrix is taken
 RUNG_ITERATIONS = 10  # of each wider loss in graduated non-convexity
 
 
@@ -77,6 +87,8 @@ class GaussNewton(Session):
         pattern = self.form_.pattern
         self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._linear = factorization(pattern, self.settings.linear_solver)
+        self.sparse = pattern.size > DENSE_SIZE
+        self.heavy = self.sparse and pattern.work >= HEAVY_WORK
         rungs = ladder(problem) if self.settings.graduated else []
         self._rungs = [LeastSquares(rung, Layout(rung), self.settings.whole) for rung in rungs]
         self._renew()
@@ -163,6 +175,8 @@ class _Search:
         self.multipliers: np.ndarray | None = None
         self.penalty = 0.0
         self.doubtful = False  # the last step was no exact one, so its decrease is no test of convergence
+        self.gained: float | None = None  # decrease of the last step, where its factorization may serve again
+        self.ahead: tuple[float, np.ndarray, np.ndarray] | None = None  # linearization where the last step led
         self.numbers = bound.numbers
         if session.constraints.size or not session.settings.screen:
             self.lower, self.upper = session.constraints.bounds(bound.numbers, bound.flags)
@@ -175,7 +189,8 @@ class _Search:
         while self.iterations < limit:
             if time.perf_counter() > deadline:
                 return Status.TIME_LIMIT, f"stopped after {self.options.time_limit:g} s"
-            cost, gradient, hessian = self.bound.linearize(self.point)
+            cost, gradient, hessian = self.ahead or self.bound.linearize(self.point)
+            self.ahead = None
             if not np.isfinite(cost):
                 return Status.FAILED, "the cost is not finite at the iterate"
             self.iterations += 1
@@ -209,6 +224,7 @@ class _Search:
         session = self.session
         session.pins.reduce(gradient, hessian, session.form_.pattern)
         violation = self._violation(self.point)
+        kept = None if forced else self._kept_step(cost, gradient, hessian, tolerance)
         while True:
             damped = hessian
             if self.damping > 0:
@@ -216,7 +232,9 @@ class _Search:
                 damped[self.diagonal] += self.damping * np.maximum(hessian[self.diagonal], 1e-12)
             step = np.full(gradient.size, np.nan)
             try:
-                if session.settings.screen:
+                if kept is not None:
+                    step = kept
+                elif session.settings.screen:
                     session._linear.factor(damped)
                     step = -session._linear.solve(gradient)
                     if not np.isfinite(step).all():
@@ -234,28 +252,51 @@ class _Search:
                 failed, step = self._constrained(step, gradient, damped)
                 if failed is not None:
                     return failed
-            decrease = -float(gradient @ step) - self._curvature(hessian, step) / 2
+            if kept is None and not session.constraints.size and session.settings.screen:
+                pull = self.damping * np.maximum(hessian[self.diagonal], 1e-12) @ step**2
+                decrease = (float(pull) - float(gradient @ step)) / 2  # as the step solves the damped system
+            else:
+                decrease = self._decrease(gradient, hessian, step)
             small = abs(decrease) <= tolerance * max(1.0, cost) and self.damping <= DAMPING_START
             trial = self.layout.retract(self.point, step)
             if forced:
                 self.point = trial
                 return None
-            new = self.bound.cost(trial)
+            # an undamped step is nearly always taken, and its linearization gives the cost as well
+            ahead = None if small or self.damping > 0 else self.bound.linearize(trial)
+            new = self.bound.cost(trial) if ahead is None else ahead[0]
             new_violation = self._violation(trial)
             if session.constraints.size:
                 self.penalty = max(self.penalty, 2 * float(np.abs(self.multipliers).max(initial=0.0)))
             merit = cost + self.penalty * violation.sum()
             new_merit = new + self.penalty * new_violation.sum()
             if np.isfinite(new_merit) and new_merit <= merit + 1e-14 * abs(merit):
-                self.point = trial
+                self.point, self.ahead = trial, ahead
+                near = cost - new <= NEAR * max(1.0, cost) and self.damping == 0 and not session.constraints.size
+                self.gained = cost - new if near else None
                 self.damping = self.damping / 10 if self.damping > 1e-9 else 0.0
                 if small and new_violation.max(initial=0.0) <= self.options.tolerance * 10:
                     return Status.SOLVED, ""
                 return None
             if small and violation.max(initial=0.0) <= self.options.tolerance * 10:
                 return Status.SOLVED, ""  # no descent left above rounding
+            if kept is not None:
+                kept = None
+                continue
             if not self._harder():
                 return Status.INACCURATE, f"no descent found; predicted decrease {decrease:.3g}"
+
+    def _kept_step(self, cost: float, gradient: np.ndarray, hessian: np.ndarray, tolerance: float) -> np.ndarray | None:
+        """The step of the last factorization, if it shows convergence or saves an expensive one; else None."""
+        if self.gained is None or not (self.session.sparse and self.session.settings.screen):
+            return None
+        step = -self.session._linear.solve(gradient)
+        decrease = self._decrease(gradient, hessian, step)
+        contracted = CONTRACTION * self.gained if self.session.heavy else 0.0
+        return step if abs(decrease) <= max(tolerance * max(1.0, cost), contracted) else None
+
+    def _decrease(self, gradient: np.ndarray, hessian: np.ndarray, step: np.ndarray) -> float:
+        return -float(gradient @ step) - self._curvature(hessian, step) / 2
 
     def _harder(self) -> bool:
         self.damping = max(DAMPING_START, self.damping * 10)
