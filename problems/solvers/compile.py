@@ -18,6 +18,7 @@ from problems.forms.affine import require_affine
 from problems.forms.quadratic import QuadraticProgram
 from problems.problem import Problem
 from problems.solvers.base import Options
+from problems.solvers.qp_empty import require_nonempty
 from problems.solvers.qp_session import QPSession
 from problems.solvers.qp_support import Backend, checked_settings
 from problems.solvers.session import Session
@@ -77,6 +78,7 @@ def _quadratic(
             raise
         raise FormError(f"solver {solver!r} takes quadratic programs only: {error}") from error
     program = QuadraticProgram(problem, eliminate)
+    require_nonempty(program)
     screen = bool(settings.pop("screen", backend is None))
     warm = bool(settings.pop("warm", True))
     if backend is None:
