@@ -26,7 +26,7 @@ def require_nonempty(program: QuadraticProgram) -> None:
     R = sp.vstack([sp.csr_array(r.R) for r in rows], format="csr")
     if is_infeasible(R, lower, upper):
         names = ", ".join(r.layout.term.what for r in rows)
-        raise EmptyConstraintError(f"{names} contradict each other: no point satisfies all of them, whatever the data are")
+        raise EmptyConstraintError(f"{names} contradict each other: no point satisfies all, whatever the data are")
 
 
 def _fixed(term: Term) -> bool:
