@@ -584,6 +584,7 @@ def test_rank_weights_on_unselected_random_graphs() -> None:
     assert np.mean(better) >= 0.9
 
 
+@pytest.mark.filterwarnings("ignore:.*have weight zero:problems.errors.ModelWarning")
 def test_rank_weights_are_worse_on_the_cycle() -> None:
     network, drawn, phi, gamma, steady = graph_of(CYCLE), nine_trials(50, 14), [], [], []
     for weights in ("uniform", "rank"):
