@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from problems.errors import DataError, FormError, MissingExtraError
-from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows
+from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, noise_numbers
 from problems.forms.native_factors import NativeFactor
 from problems.forms.residual_code import residual_code
 from problems.forms.template import Template, template_of
@@ -116,12 +116,10 @@ class PointCode:
 
 
 def roots(entry: TermLayout, store: DataStore) -> np.ndarray:
-    noise = entry.term.noise
+    """Square-root information of the instances, as `problems.noise.whitening` gives it."""
+    noise, dim = entry.term.noise, template_of(entry.term).dim
     assert noise is not None
-    value = noise.value
-    if isinstance(value, DataSlot):
-        value = store[value.source.name][value.indices].reshape(len(value.indices), *value.source.shape)
-    return whitening(noise.kind, value, template_of(entry.term).dim, entry.term.count, entry.term.what)
+    return whitening(noise.kind, noise_numbers(entry.term, dim, store), dim, entry.term.count, entry.term.what)
 
 
 def noise_models(root: np.ndarray, native: NativeFactor | None, loss: Loss) -> list[Any]:
