@@ -14,6 +14,7 @@ import pytest
 
 import problems.forms.quadratic as quadratic
 from problems import Gaussian, Problem, Vector
+from problems.forms.factor_graph import FactorGraph
 from problems.forms.layout import DataStore, Layout
 from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.nonlinear import NonlinearProgram
@@ -563,6 +564,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "part of w condensed": {"solver": "daqp", "eliminate": ("w", slice(0, 1))},
     "whole": {"solver": "gauss-newton", "whole": True},
     "array": {"solver": "gauss-newton", "whole": False},
+    "ipopt": {"solver": "ipopt", "tolerance": 1e-9},
     "sparse": {"solver": "auto", "sparse": True},
     "sparse, condensed": {"solver": "proxqp", "sparse": True, "eliminate": ("w", slice(None))},
 }
@@ -597,3 +599,46 @@ def test_every_way_finds_the_optimum(way: str, monkeypatch: pytest.MonkeyPatch) 
             assert max(solution.residuals.values()) < 1e-6 * size
             m.redraw()
             m.fit_bounds()
+
+
+@pytest.mark.filterwarnings("ignore::problems.errors.SlowPathWarning")
+@pytest.mark.parametrize("solver", ["gtsam-lm", "gtsam-gn"])
+def test_graphs_find_the_optimum(solver: str) -> None:
+    pytest.importorskip("gtsam")
+    for seed in SEEDS[:8]:
+        m = draw(seed, inequalities=False)
+        session = m.problem.compile(solver)
+        for _ in range(2):
+            want = m.dense()
+            exact = want.solve(np.ones(want.l.size))
+            solution = session.solve(m.values)
+            assert solution.solved, (seed, solution)
+            np.testing.assert_allclose(flat(solution), exact, atol=1e-5 * max(1.0, np.abs(exact).max()))
+            assert solution.objective == pytest.approx(want.objective(exact), rel=1e-8, abs=1e-8)
+            m.redraw()
+
+
+@pytest.mark.filterwarnings("ignore::problems.errors.SlowPathWarning")
+@pytest.mark.parametrize("seed", SEEDS[:8])
+def test_the_error_of_a_graph_is_the_cost_up_to_a_constant(seed: int) -> None:
+    pytest.importorskip("gtsam")
+    m = draw(seed, inequalities=False)
+    graph, want = FactorGraph(m.problem), m.dense()
+    equal = want.A, want.l
+    free = np.linalg.svd(equal[0])[2][np.linalg.matrix_rank(equal[0]) :].T if want.l.size else np.eye(want.q.size)
+    start = np.linalg.pinv(equal[0]) @ equal[1] if want.l.size else np.zeros(want.q.size)
+    differences = []
+    for _ in range(3):
+        z = start + free @ m.normal(free.shape[1])  # where the equalities hold
+        point = {n: z[a : a + v.size].reshape(v.shape) for (n, v), a in zip(shapes(m).items(), offsets(m), strict=True)}
+        native, values, _ = graph.to_gtsam(m.values, point)
+        differences.append(native.error(values) - want.objective(z))
+    np.testing.assert_allclose(differences, differences[0], atol=1e-7 * max(1.0, abs(differences[0])))
+
+
+def shapes(model: Model) -> dict[str, np.ndarray]:
+    return {n: np.zeros((v.count, v.space.dim)) for n, v in model.problem.unknowns.items()}
+
+
+def offsets(model: Model) -> list[int]:
+    return list(model.starts()[0].values())
