@@ -22,6 +22,7 @@ from problems.errors import FormError, SettingError, ShapeError, UnknownNameErro
 from problems.models import Model
 from problems.noise import L2, Gaussian, Loss
 from problems.problem import Data, Problem, Slot, Variable
+from problems.soft import Soft
 from problems.solvers.compile import ALIASES, is_affine
 from problems.solvers.session import Session, Solution
 from problems.spaces import Vector
@@ -161,7 +162,7 @@ class Window:
         return tuple(
             f"{name} bounds"
             for name in self.bounds
-            if solution[f"{name} slack"][: slots[name]].max(initial=0.0) > VIOLATED
+            if solution[f"{name} bounds slack"][: slots[name]].max(initial=0.0) > VIOLATED
         )
 
     def used(self, measurements: np.ndarray) -> np.ndarray:
@@ -341,55 +342,35 @@ class Window:
         if not polyhedron.matrix.shape[0]:
             return
         self.bounds = (*self.bounds, name)
-        active = self._filled if name == "state" else self._filled[1:]
-        if self.penalty is None:
-            residual, on, data = self._bounded(name, polyhedron)
-            lower, upper = polyhedron.lower, polyhedron.upper
-            self.problem.inequality(
-                f"{name} bounds", residual, on=on, data=data, lower=lower, upper=upper, active=active
-            )
-        else:
-            self._soft(name, polyhedron, active, self.penalty)
+        residual, on, data = self._bounded(name, polyhedron)
+        self.problem.inequality(
+            f"{name} bounds",
+            residual,
+            on=on,
+            data=data,
+            lower=polyhedron.lower,
+            upper=polyhedron.upper,
+            active=self._filled if name == "state" else self._filled[1:],
+            soft=None if self.penalty is None else Soft(self.penalty, SLACK_CURVATURE),
+        )
 
     def _bounded(
-        self, name: str, polyhedron: Polyhedron, slack: Variable | None = None, sign: float = 0.0
+        self, name: str, polyhedron: Polyhedron
     ) -> tuple[Callable[..., Any], tuple[Any, ...], tuple[Any, ...]]:
-        """Rows of a bound, relaxed by ``sign * slack``: residual, slots and data."""
+        """Rows of a bound: residual, slots and data."""
         chosen = None if polyhedron.components is None else polyhedron.components.tolist()
 
-        def rows(v: Any, relaxed: Any) -> Any:
-            value = ca.DM(polyhedron.matrix) @ v if chosen is None else v[chosen]
-            return value if relaxed is None else value + sign * relaxed
+        def rows(v: Any) -> Any:
+            return ca.DM(polyhedron.matrix) @ v if chosen is None else v[chosen]
 
-        extra = {} if slack is None else {"slack": slack}
         if name == "state" or self.w is not None:
-            own = self.x if name == "state" else self.w
-            return self._term(lambda v, slack=None: rows(v, slack), {"v": own, **extra}, {})
+            return self._term(rows, {"v": self.x if name == "state" else self.w}, {})
         # what an observer adds is what it moves beyond the model, so its rows need no measurements
         back = ca.DM(np.eye(self.model.state_size) if self.gain is not None else np.linalg.inv(self.model.G))
         return self._model_term(
-            lambda x, ahead, slack=None, **rest: rows(back @ (ahead - self._moved(x, **rest)), slack),
-            {"x": self.x[:-1], "ahead": self.x[1:], **extra},
+            lambda x, ahead, **rest: rows(back @ (ahead - self._moved(x, **rest))),
+            {"x": self.x[:-1], "ahead": self.x[1:]},
             {"u": self._u[1:]} if self._u is not None else {},
-        )
-
-    def _soft(self, name: str, polyhedron: Polyhedron, active: Any, penalty: float) -> None:
-        """Rows that slacks may relax, at a price linear in the violation (exact penalty)."""
-        size = polyhedron.matrix.shape[0]
-        slack = self.problem.variables(f"{name} slack", Vector(size), self.horizon + (name == "state"))
-        for key, sign in (("upper", -1.0), ("lower", 1.0)):
-            bound = getattr(polyhedron, key)
-            if np.isfinite(bound).any():
-                residual, on, data = self._bounded(name, polyhedron, slack, sign)
-                limits: dict[str, Any] = {"lower": -np.inf, "upper": np.inf, key: bound}
-                self.problem.inequality(f"{name} bounds {key}", residual, on=on, data=data, active=active, **limits)
-        self.problem.inequality(f"{name} slack sign", lambda s: s, on=slack, lower=0.0, upper=np.inf)
-        self.problem.cost(
-            f"{name} slack cost",
-            lambda s: s,
-            on=slack,
-            noise=Gaussian(information=SLACK_CURVATURE * np.eye(size)),
-            linear=np.full(size, penalty),
         )
 
 

@@ -16,7 +16,6 @@ from problems.solvers.session import Session
 
 SOLVED = (Status.SOLVED, Status.INACCURATE)
 STOPPED = (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
-VIOLATED = 1e-6  # slack beyond which a soft bound counts as not met
 
 
 def predicted(model: LinearModel, before: np.ndarray, inputs: np.ndarray, newest: int, slid: bool) -> np.ndarray:
@@ -70,10 +69,9 @@ class Fallback:
         if not self._soft:
             return prediction, everything
         if self._session is None:
-            self._session = self._pool.get(*self._problem, soft=True)[1].fork()
+            self._window, session = self._pool.get(*self._problem, soft=True)[:2]
+            self._session = session.fork()
         solution = self._session.solve(data)
         if solution.status not in SOLVED:
             return prediction, everything
-        slots = {"state": newest + 1, "disturbance": newest}
-        unmet = [name for name in self._names if solution[f"{name} slack"][: slots[name]].max(initial=0.0) > VIOLATED]
-        return solution["x"], [f"{name} bounds" for name in unmet]
+        return solution["x"], list(self._window.unmet(solution, newest + 1))
