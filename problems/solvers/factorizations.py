@@ -25,7 +25,7 @@ DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
 BLOCK_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
 HEAVY_WORK = 2e7  # the same for Pardiso, whose import takes a second once
 
-LinearSolver = Literal["auto", "dense", "qdldl", "superlu", "pardiso", "cholmod"]
+LinearSolver = Literal["auto", "dense", "qdldl", "superlu", "pardiso", "cholmod", "schur"]
 
 
 class SingularError(ArithmeticError):
@@ -83,7 +83,7 @@ class SparseLDL:
     def factor(self, values: np.ndarray) -> None:
         import qdldl
 
-        _check(values, self._pattern)
+        check_values(values, self._pattern)
         self._matrix.data = values
         try:
             if self._solver is None:
@@ -112,7 +112,7 @@ class SuperLU:
         self._factor: tuple[Any, np.ndarray]  # and the order of its rows
 
     def factor(self, values: np.ndarray) -> None:
-        _check(values, self._pattern)
+        check_values(values, self._pattern)
         self._matrix.data = values[self._source]
         try:
             found = _eliminated(self._matrix, "NATURAL" if self._arranged else "MMD_AT_PLUS_A")
@@ -157,7 +157,7 @@ class Pardiso:
         self._solver: Any = None
 
     def factor(self, values: np.ndarray) -> None:
-        _check(values, self._pattern)
+        check_values(values, self._pattern)
         self._matrix.data = values[self._source]
         if self._solver is None:
             solver = _pardiso()
@@ -199,7 +199,7 @@ class CHOLMOD:
         import cvxopt
         import cvxopt.cholmod
 
-        _check(values, self._pattern)
+        check_values(values, self._pattern)
         self._matrix.V = cvxopt.matrix(values)
         if self._factor is None:
             self._factor = cvxopt.cholmod.symbolic(self._matrix, uplo="U")
@@ -237,10 +237,15 @@ def factorization(pattern: HessianPattern, solver: LinearSolver = "auto") -> Fac
             solver = "superlu" if pattern.work >= BLOCK_WORK else "qdldl"
     elif solver == "pardiso" and find_spec("pypardiso") is None:
         raise MissingExtraError("linear solver pardiso", "pypardiso", "pardiso")
+    elif solver == "schur":
+        from problems.solvers.schur import SchurComplement
+
+        return SchurComplement(pattern)
     return CLASSES[solver](pattern)
 
 
-def _check(values: np.ndarray, pattern: HessianPattern) -> None:
+def check_values(values: np.ndarray, pattern: HessianPattern) -> None:
+    """Raises SingularError where no factorization could succeed."""
     if not np.isfinite(values).all():
         raise SingularError("the matrix is not finite")
     if (values[pattern.diagonal] <= 0).any():

@@ -55,7 +55,8 @@ class Settings:
         screen: answer steps that satisfy the linearized constraints by the linear solve; else the QP backend is always
             called.
         linear_solver: factorization of the normal equations: ``dense``, ``qdldl``, ``superlu``, ``pardiso`` (extra
-            ``pardiso``), ``cholmod`` (extra ``gpl``), or ``auto``: by size, work and what is installed.
+            ``pardiso``), ``cholmod`` (extra ``gpl``), ``schur`` (few poses, many landmarks), or ``auto``: by size, work
+            and what is installed.
         graduated: graduated non-convexity: come to the robust losses from wider ones, past local minima of outliers.
     """
 
