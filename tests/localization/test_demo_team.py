@@ -143,9 +143,9 @@ class Impossible(Drawn):
     def problem(self, method: str) -> tuple[Problem, dict[str, np.ndarray]]:
         problem, data = super().problem(method)
         assert self.fence is not None
-        upper = [self.fence[0][0] - 1, np.inf]
-        problem.inequality("away", lambda place: place, on=problem.unknowns["robot"], upper=upper)
-        return problem, data
+        limit = problem.data("limit", 2)  # as data, or compiling would refuse the empty set
+        problem.inequality("away", lambda place: place, on=problem.unknowns["robot"], upper=limit)
+        return problem, data | {"limit": np.array([self.fence[0][0] - 1, np.inf])}
 
 
 def test_what_is_not_solved_says_so_and_has_no_metrics() -> None:
