@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -179,8 +179,9 @@ class QRQP(_Conic):
 class HPIPMSettings:
     """Settings of `HPIPM`; None keeps the library's default or what follows from `Options`.
 
-    The unknowns are ordered ``x_0, u_0, x_1, u_1, ..., x_N``, the rows ``dynamics_0, others_0, dynamics_1, ...`` with
-    dynamics ``A_k x_k + B_k u_k - x_{k+1} = b_k``; P joins only unknowns of the same stage.
+    Without N, nx, nu and ng there is one stage. Else the unknowns are ordered ``x_0, u_0, x_1, u_1, ..., x_N``, the
+    rows ``dynamics_0, others_0, dynamics_1, ...`` with dynamics ``A_k x_k + B_k u_k - x_{k+1} = b_k``; P joins only
+    unknowns of the same stage.
 
     Attributes:
         N: number of stages after the first.
@@ -218,10 +219,10 @@ class HPIPMSettings:
 
 
 class HPIPM(_Conic):
-    """QP backend ``hpipm``.
+    """QP backend ``hpipm``: any quadratic program as one dense stage, or in the stages that its settings state.
 
     Raises:
-        FormError: the stages are not given, or P and A do not have the structure they say.
+        FormError: the stages are given in part, or P and A do not have the structure they say.
     """
 
     name: ClassVar[str] = "hpipm"
@@ -230,11 +231,15 @@ class HPIPM(_Conic):
 
     def __init__(self, P: Any, q: np.ndarray, A: Any, l: np.ndarray, u: np.ndarray, options: Options) -> None:
         settings = checked_settings(HPIPMSettings, options.extra, self.name)
-        stages = (settings.N, settings.nx, settings.nu, settings.ng)
-        if any(value is None for value in stages):
+        stages = {name: getattr(settings, name) for name in ("N", "nx", "nu", "ng")}
+        missing = [name for name, value in stages.items() if value is None]
+        if len(missing) == len(stages):
+            one = {"N": 0, "nx": (P.shape[0],), "nu": (0,), "ng": (A.shape[0],)}
+            options = replace(options, extra={**options.extra, **one})
+        elif missing:
             raise FormError(
-                "solver hpipm takes quadratic programs in stages x_0, u_0, x_1, ... only; give their structure as "
-                "settings N, nx, nu, ng, or use daqp, osqp or proxqp for a quadratic program without stages"
+                "solver hpipm: stages are stated by the settings N, nx, nu and ng together, and "
+                f"{', '.join(missing)} is missing; without any of them the program is one stage"
             )
         super().__init__(P, q, A, l, u, options)
 

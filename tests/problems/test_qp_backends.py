@@ -843,12 +843,22 @@ def test_hpipm_on_stages(tolerance: float) -> None:
         np.testing.assert_allclose(result.x, reference.x, atol=30 * tolerance**0.75)
 
 
-def test_hpipm_needs_stages() -> None:
+def test_hpipm_without_stages_takes_any_program_as_one() -> None:
+    from problems.solvers.qp_casadi import HPIPM
+
+    for qp in (staged_qp(np.random.default_rng(18))[0], random_qp(np.random.default_rng(2), 8, 12, 3)):
+        status, result = qp.judged(qp.backend(HPIPM))
+        assert status is Status.SOLVED, result.message
+        reference = qp.judged(qp.backend(backend_class("daqp")))[1]
+        np.testing.assert_allclose(result.x, reference.x, atol=1e-5)
+
+
+def test_hpipm_refuses_stages_that_are_not_there() -> None:
     from problems.solvers.qp_casadi import HPIPM
 
     qp, stages = staged_qp(np.random.default_rng(18))
-    with pytest.raises(FormError, match="stages"):
-        qp.backend(HPIPM)
+    with pytest.raises(FormError, match="ng is missing"):
+        qp.backend(HPIPM, extra={name: value for name, value in stages.items() if name != "ng"})
     with pytest.raises(FormError, match="N, nx, nu, ng"):
         qp.backend(HPIPM, extra={**stages, "N": 3})
     dense = random_qp(np.random.default_rng(0), len(qp.q), len(qp.l), 0)
