@@ -40,7 +40,7 @@ class QPSolversSettings:
 
 
 class QPSolvers(Backend):
-    """Base of the backends ``qpsolvers:NAME``; see `qpsolvers_backend`.
+    """Base of the backends ``qpsolvers:NAME``; see `Named`.
 
     The package takes a problem whole at every call, so what is kept between calls are its matrices only. Settings are
     passed on as they are, by the names `qpsolvers` documents for the solver. It has no common time limit, iteration
@@ -121,20 +121,35 @@ class QPSolvers(Backend):
         self._fill()
 
 
-def qpsolvers_backend(name: str) -> type[QPSolvers]:
-    """The backend for solver `name` of `qpsolvers`.
+class Named:
+    """What ``qpsolvers:NAME`` names: called with NAME, it gives the backend."""
 
-    Args:
-        name: one of ``qpsolvers.available_solvers``.
+    named: ClassVar[bool] = True
+    forms: ClassVar[tuple[str, ...]] = ("quadratic",)
+    warm_starts: ClassVar[bool] = QPSolvers.warm_starts
+    extra: ClassVar[str | None] = QPSolvers.extra
 
-    Raises:
-        MissingExtraError: qpsolvers is not installed.
-        UnknownNameError: the solver is not known to qpsolvers, or its package is not installed.
-    """
-    try:
-        import qpsolvers
-    except ImportError as error:
-        raise MissingExtraError(f"solver qpsolvers:{name}", "qpsolvers") from error
-    if name not in qpsolvers.available_solvers:
-        raise UnknownNameError("solver of qpsolvers", name, qpsolvers.available_solvers)
-    return type(f"QPSolvers_{name}", (QPSolvers,), {"name": f"qpsolvers:{name}", "solver": name})
+    def __call__(self, name: str) -> type[QPSolvers]:
+        """The backend for solver `name` of `qpsolvers`.
+
+        Args:
+            name: one of ``qpsolvers.available_solvers``.
+
+        Raises:
+            MissingExtraError: qpsolvers is not installed.
+            UnknownNameError: the solver is not known to qpsolvers, or its package is not installed.
+        """
+        try:
+            import qpsolvers
+        except ImportError as error:
+            raise MissingExtraError(f"solver qpsolvers:{name}", "qpsolvers") from error
+        if name not in qpsolvers.available_solvers:
+            raise UnknownNameError("solver of qpsolvers", name, qpsolvers.available_solvers)
+        return type(f"QPSolvers_{name}", (QPSolvers,), {"name": f"qpsolvers:{name}", "solver": name})
+
+    def version(self) -> str:
+        """Of the package `qpsolvers`; raises MissingExtraError when it is not installed."""
+        return QPSolvers.version()
+
+
+qpsolvers_backend = Named()
