@@ -2,7 +2,7 @@
 
 As in `localization.measurements`, whose position, range, displacement and landmark templates serve both dimensions and
 are repeated here by name. Directions are vectors (3,) of any length. Residuals equal those of gtsam's factors component
-by component (gtsam puts rotation before translation and bearing before range; `problems.spatial.GTSAM_ORDER`). Spec
+by component (gtsam puts rotation before translation: `problems.spatial.GTSAM_ORDER`). Spec
 ``gps-range-bearing-localization`` 10, 3-D. Units: metres and radians.
 """
 
