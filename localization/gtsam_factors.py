@@ -10,15 +10,28 @@ import gtsam
 import numpy as np
 
 from localization import measurements as meas
+from localization import measurements_3d as meas_3d
 from problems.forms.native_factors import register_native
 from problems.spaces import SE2, SO2, Vector
-from problems.spatial import SE3
+from problems.spatial import GTSAM_ORDER, SE3, SO3
 
 POINT2, POINT3 = Vector(2), Vector(3)
 
 
+TURNED = tuple(GTSAM_ORDER.tolist())
+
+
 def _pose(z: np.ndarray) -> gtsam.Pose2:
     return gtsam.Pose2(z[0], z[1], z[2])
+
+
+def _rotation(z: np.ndarray) -> gtsam.Rot3:
+    x, y, z, w = z / np.linalg.norm(z)
+    return gtsam.Rot3.Quaternion(w, x, y, z)
+
+
+def _pose_3d(z: np.ndarray) -> gtsam.Pose3:
+    return gtsam.Pose3(_rotation(z[3:]), z[:3])
 
 
 register_native(meas.position, (SE2,), lambda i, z, noise: gtsam.PoseTranslationPrior2D(i, z, noise))
@@ -34,6 +47,21 @@ for _space in (Vector(1), POINT2, POINT3):
         meas.relative_position, (_space, _space), lambda i, j, z, noise: gtsam.BetweenFactorVector(i, j, z, noise)
     )
 
+register_native(
+    meas_3d.pose_log, (SE3,), lambda i, z, noise: gtsam.PriorFactorPose3(i, _pose_3d(z), noise), order=TURNED
+)
+register_native(
+    meas_3d.relative_pose_log,
+    (SE3, SE3),
+    lambda i, j, z, noise: gtsam.BetweenFactorPose3(i, j, _pose_3d(z), noise),
+    order=TURNED,
+)
+register_native(meas_3d.orientation, (SO3,), lambda i, z, noise: gtsam.PriorFactorRot3(i, _rotation(z), noise))
+register_native(
+    meas_3d.relative_orientation,
+    (SO3, SO3),
+    lambda i, j, z, noise: gtsam.BetweenFactorRot3(i, j, _rotation(z), noise),
+)
 register_native(meas.position, (SE3,), lambda i, z, noise: gtsam.GPSFactor(i, z, noise))
 
 register_native(meas.distance, (SE2, SE2), lambda i, j, z, noise: gtsam.RangeFactorPose2(i, j, z[0], noise))

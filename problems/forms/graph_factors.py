@@ -197,6 +197,14 @@ def linear_factors(
     return out
 
 
+def _measured(row: np.ndarray, spaces: tuple[Space, ...]) -> np.ndarray:
+    """A measurement of random numbers; one of the size of an element is an element: of quaternions, the unit ones."""
+    for space in spaces:
+        if row.size == space.ambient:
+            return space.normalize_array(row[None])[0]
+    return row
+
+
 @lru_cache(maxsize=256)
 def is_the_residual(native: NativeFactor, template: Template, spaces: tuple[Space, ...]) -> bool:
     """Compare a native factor with our residual, errors and Jacobians, at random points."""
@@ -209,7 +217,7 @@ def is_the_residual(native: NativeFactor, template: Template, spaces: tuple[Spac
         for key, space in enumerate(spaces):
             parts.append(space.normalize_array(2 * rng.normal(size=(1, space.ambient)))[0])
             values.insert(key, to_gtsam(space)(parts[-1]))
-        rows = [rng.normal(size=symbol.shape[0]) for symbol in template.data]
+        rows = [_measured(rng.normal(size=symbol.shape[0]), spaces) for symbol in template.data]
         jacobians: list[Any] = [None] * len(spaces)
         keys = list(range(len(spaces)))
         error = code.error(spaces, keys, np.concatenate([*rows, []]), np.zeros(code.dim))
