@@ -63,6 +63,12 @@ def native_factor(residual: Callable[..., Any], spaces: tuple[Space, ...]) -> Na
     return _REGISTERED.get((residual, spaces))
 
 
+def native_factors() -> list[tuple[Callable[..., Any], tuple[Space, ...], NativeFactor]]:
+    """All that are registered: residual, spaces of its slots, and the factor."""
+    _load_entry_points()
+    return [(residual, spaces, native) for (residual, spaces), native in _REGISTERED.items()]
+
+
 @lru_cache(maxsize=1)
 def _load_entry_points() -> None:
     for name in registry.names("native_factors"):
