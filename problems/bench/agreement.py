@@ -18,7 +18,7 @@ from problems.solvers.compile import is_affine
 from problems.solvers.session import Session
 
 CERTIFIED = 1e-9  # of the residuals of a reference, relative to the size of its gradient and rows
-METRICS = ("distance_to_reference", "objective_error", "active_rows")
+METRICS = ("distance_to_reference", "objective_error", "residual", "active_rows")
 NO_POINT = (Status.INFEASIBLE, Status.UNBOUNDED, Status.FAILED)
 
 
@@ -98,8 +98,8 @@ def compared(session: Session, cases: Sequence[Case], optima: Sequence[Optimum],
     Returns:
         ``distance_to_reference``: norm of the difference of `variable` in tangent coordinates, relative to the norm of
         the optimum or 1. ``objective_error``: difference of the costs, relative to `Optimum.size`. Both are the worst
-        of all cases, None where a case has no point. ``active_rows``: of all optima together. The trace is the last
-        value of `variable`, None where no case has one.
+        of all cases, None where a case has no point. ``residual``: the largest, recomputed by us. ``active_rows``: of
+        all optima together. The trace is the last value of `variable`, None where no case has one.
     """
     space = session.problem.unknowns[variable].space
     distances, errors, residuals = [], [], []
@@ -126,6 +126,7 @@ def compared(session: Session, cases: Sequence[Case], optima: Sequence[Optimum],
         metrics={
             "distance_to_reference": max(distances) if whole else None,
             "objective_error": max(errors) if whole else None,
+            "residual": max(residuals, default=None),
             "active_rows": float(sum(optimum.active for optimum in optima)),
         },
         options={"form": session.form},

@@ -163,6 +163,7 @@ def test_answers_are_measured_against_the_optimum() -> None:
 def test_the_command_makes_the_table(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["bench", "agreement", "--out", str(tmp_path), "--trials", "1", "--json"])
     assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    rows = found["rows"] if "rows" in found else [row for part in found["scenarios"] for row in part["rows"]]
-    assert len({row["solver"] for row in rows}) >= LEAST
+    rows = json.loads(result.stdout)["rows"]
+    assert {row["scenario"] for row in rows} == {study.scenario for study in PLAN.study}
+    assert len({row["solver"] for row in rows if ":" not in row["solver"]}) >= LEAST
+    assert all(row["metrics"]["residual"] is not None for row in rows if row["status"]["solved"])
