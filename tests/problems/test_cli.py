@@ -241,7 +241,14 @@ def test_an_interrupt_keeps_the_rows_and_says_how_to_go_on(tmp_path: Path, toy_p
         "--out",
         str(out),
     ]
-    campaign = subprocess.Popen(command, env=environment(toy_package), stderr=subprocess.PIPE, text=True)
+    campaign = subprocess.Popen(
+        command,
+        env=environment(toy_package),
+        stderr=subprocess.PIPE,
+        text=True,
+        # a test run in the background of a shell ignores interrupts, and its children would inherit that
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 60
     while (
         not (out.exists() and (out / "journal.jsonl").stat().st_size > 20_000)
