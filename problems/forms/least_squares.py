@@ -6,6 +6,7 @@ NumPy would dominate, one compiled function of the whole problem.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -97,19 +98,19 @@ class LeastSquares:
         return (WholeBound if self.whole else ArrayBound)(self, store, by_name)
 
 
-class Bound:
+class Bound(ABC):
     """Costs for fixed data. `flags` tells which instances are on."""
 
     def __init__(self, form: LeastSquares, store: DataStore, flags: Flags) -> None:
         self.form, self.store, self.flags = form, store, flags
         self.numbers = np.where(np.isnan(store.numbers), 0.0, store.numbers)
 
-    def cost(self, point: np.ndarray) -> float:
-        raise NotImplementedError
+    @abstractmethod
+    def cost(self, point: np.ndarray) -> float: ...
 
+    @abstractmethod
     def linearize(self, point: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Cost, gradient (size,), Hessian entries in the order of the pattern."""
-        raise NotImplementedError
 
 
 class ArrayBound(Bound):

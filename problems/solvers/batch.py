@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -65,7 +66,7 @@ class BatchSolution:
             self.messages[entry] = solution.message
 
 
-class BatchSession:
+class BatchSession(ABC):
     """Data with a leading axis over `count` entries of one compiled session.
 
     Raises:
@@ -125,11 +126,11 @@ class BatchSession:
                 f"that divides {self.count} (one per block), got {array.shape}"
             ) from None
 
-    def _set(self, name: str, value: Any) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _set(self, name: str, value: Any) -> None: ...
 
-    def _solve(self) -> BatchSolution:
-        raise NotImplementedError
+    @abstractmethod
+    def _solve(self) -> BatchSolution: ...
 
 
 class ForkBatch(BatchSession):
