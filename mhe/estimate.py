@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from problems.display import Table
 from problems.solvers.base import Status
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from problems.solvers.session import Solution
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
     """What an estimator knows after one step.
 
@@ -43,6 +44,25 @@ class Estimate:
     late: tuple[float, ...]
     time: float
     state_names: tuple[str, ...]
+
+    def table(self) -> Table:
+        """States with their standard deviations."""
+        deviations: list[Any] = [None] * len(self.state_names)
+        if self.covariance is not None:
+            deviations = np.sqrt(np.diag(self.covariance)).tolist()
+        notes = [f"{self.seconds * 1e6:.0f} us"]
+        notes += [f"not met: {', '.join(self.infeasible)}"] if self.infeasible else []
+        notes += [f"{len(self.missing)} missing"] if self.missing else []
+        notes += [f"{len(self.late)} late"] if self.late else []
+        caption = f"{type(self).__name__} at {self.time:g} s: {self.status}, {', '.join(notes)}"
+        rows = list(zip(self.state_names, self.state.tolist(), deviations, strict=True))
+        return Table(caption, ("state", "estimate", "sigma"), rows)
+
+    def __repr__(self) -> str:
+        return str(self.table())
+
+    def _repr_html_(self) -> str:
+        return self.table()._repr_html_()
 
     def to_pandas(self) -> pd.DataFrame:
         """One row, to be concatenated over steps: `time` (index), states by name, ``sigma_<name>``, status, seconds."""

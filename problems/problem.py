@@ -19,6 +19,8 @@ from problems.noise import L2, Gaussian, Loss
 from problems.spaces import Space
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from problems.soft import Soft
     from problems.solvers.session import Session
 
@@ -158,6 +160,31 @@ class Problem:
         lines = [f"Problem {self.name!r}"]
         lines += [f"  {entry!r}" for part in (self.unknowns, self.inputs, self.terms) for entry in part.values()]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from problems.display import Table
+
+        rows: list[tuple[Any, ...]] = [
+            ("variables", v.name, v.count, f"on {v.space.name}") for v in self.unknowns.values()
+        ]
+        for d in self.inputs.values():
+            rows.append(("data", d.name, "shared" if d.count is None else d.count, f"shape {d.shape}"))
+        for t in self.terms.values():
+            parts = ["on " + ", ".join(s.source.name for s in t.slots)]
+            parts += ["reads " + ", ".join(s.source.name for s in t.data)] if t.data else []
+            parts += [repr(t.loss)] if not isinstance(t.loss, L2) else []
+            rows.append((t.kind, t.name, t.count, "; ".join(parts)))
+        return Table(f"Problem {self.name!r}", ("kind", "name", "count", ""), rows)._repr_html_()
+
+    def plot_structure(self) -> Figure:
+        """Picture of the factor graph and of the sparsity of the normal equations; see `problems.structure`.
+
+        Raises:
+            DefinitionError: nothing was stated yet.
+        """
+        from problems.structure import plot_structure
+
+        return plot_structure(self)
 
     def variables(self, name: str, space: Space, count: int = 1) -> Variable:
         """Add `count` unknowns on `space`.

@@ -86,6 +86,13 @@ class FactorGraph:
         lines += [f"  {t.name!r}: {t.count} {t.kind} factor(s) {t.reason}".rstrip() for t in self.terms]
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        from problems.display import Table
+
+        rows = [(t.name, t.count, t.kind, t.reason) for t in self.terms]
+        caption = f"FactorGraph of {self.problem.name!r}: {len(self._block_keys)} values"
+        return Table(caption, ("term", "factors", "kind", "reason"), rows)._repr_html_()
+
     def key(self, name: str, index: int = 0) -> int:
         """gtsam key of an instance. Raises UnknownNameError, DefinitionError."""
         if name not in self.keys:

@@ -117,6 +117,12 @@ class NonlinearProgram:
         v, p, g = (part.shape[0] for part in (self.variables, self.parameter, self.constraints))
         return f"<NonlinearProgram of {self.problem.name!r}: {v} unknowns, {g} rows, {p} parameters>"
 
+    def _repr_html_(self) -> str:
+        from problems.display import Table
+
+        rows = [(name, part.stop - part.start) for name, part in self.rows.items()]
+        return Table(repr(self).strip("<>"), ("constraint", "rows"), rows)._repr_html_()
+
     @property
     def casadi(self) -> dict[str, ca.MX]:
         """``{"x", "p", "f", "g"}``, what `casadi.nlpsol` takes."""

@@ -244,6 +244,12 @@ class QuadraticProgram:
         shape = f", {reduced.size} unknowns, {reduced.A.shape[0]} rows" if reduced else ""
         return f"<QuadraticProgram of {self.problem.name!r}{shape}, {'dense' if self.dense else 'sparse'}>"
 
+    def _repr_html_(self) -> str:
+        from problems.display import Table
+
+        rows = [(name, self.speeds[name], ", ".join(parts)) for name, parts in self.changes.items()]
+        return Table(repr(self).strip("<>"), ("data", "speed", "changes"), rows)._repr_html_()
+
     @property
     def changes(self) -> dict[str, tuple[str, ...]]:
         """Which of P, q, A, l, u change with each datum."""

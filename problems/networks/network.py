@@ -175,6 +175,12 @@ class Network:
         kind = "undirected" if self.is_undirected else "directed"
         return f"Network({self.count} nodes, {len(self.edges)} directed links, {kind})"
 
+    def _repr_html_(self) -> str:
+        from problems.display import Table
+
+        rows = [(label, self.names(self.in_neighborhood(i))) for i, label in enumerate(self.labels)]
+        return Table(repr(self), ("node", "hears"), rows)._repr_html_()
+
     def index(self, label: Hashable) -> int:
         """Index of the node with this label.
 

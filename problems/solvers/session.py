@@ -113,6 +113,13 @@ class Solution:
         lines += [f"  {name}: {np.array2string(v, precision=4, threshold=8)}" for name, v in self.values.items()]
         return "\n".join(lines + ([f"  {self.message}"] if self.message else []))
 
+    def _repr_html_(self) -> str:
+        from problems.display import Table
+
+        caption = f"{self.status} by {self.method}, {self.iterations} iteration(s), objective {self.objective:.6g}"
+        rows = [(name, len(value), value) for name, value in self.values.items()]
+        return Table(f"Solution: {caption}", ("variables", "count", "values"), rows)._repr_html_()
+
 
 class Session(ABC):
     """A problem compiled for one solver: set up once, solve many times.
