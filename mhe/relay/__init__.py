@@ -1,0 +1,18 @@
+"""Moving horizon estimation with measurements relayed over l hops and fused arrival costs (dmhe-l-step)."""
+
+from mhe.relay.design import RelayDesign
+from mhe.relay.options import RELAY_METHODS, RelayOptions, relay_options_of
+from mhe.relay.report import RelayReport
+from mhe.relay.rule import held, reach
+from mhe.relay.schedule import RelaySchedule
+
+__all__ = [
+    "RELAY_METHODS",
+    "RelayDesign",
+    "RelayOptions",
+    "RelayReport",
+    "RelaySchedule",
+    "held",
+    "reach",
+    "relay_options_of",
+]
