@@ -1,12 +1,16 @@
-"""Tables of what the library's objects hold, as text for a terminal and as HTML for Jupyter."""
+"""Tables and figures that show themselves in a terminal and in Jupyter."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LONGEST = 60  # rows of a table; what follows is counted
 
@@ -54,3 +58,16 @@ def shown(value: Any) -> str:
     if isinstance(value, (float, np.floating)):
         return f"{value:.6g}"
     return "" if value is None else str(value)
+
+
+def figure(**options: Any) -> Figure:
+    """An empty ``matplotlib.figure.Figure``, outside of pyplot's bookkeeping.
+
+    Args:
+        options: of the figure.
+    """
+    if "ipykernel" in sys.modules:
+        import matplotlib.pyplot  # noqa: F401  registers how a notebook shows figures
+    from matplotlib.figure import Figure
+
+    return Figure(**options)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from problems.display import figure
 from problems.forms.layout import Layout
 
 if TYPE_CHECKING:
@@ -33,19 +34,17 @@ def plot_structure(problem: Problem) -> Figure:
     Raises:
         DefinitionError: nothing was stated yet.
     """
-    from matplotlib.figure import Figure
-
     from problems.errors import DefinitionError
 
     if not problem.unknowns or not problem.terms:
         raise DefinitionError(f"problem {problem.name!r} has no variables or no terms yet; there is nothing to draw")
     layout = Layout(problem)
-    figure = Figure(figsize=(11, 5), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    drawing = figure(figsize=(11, 5), layout="constrained")
+    left, right = drawing.subplots(1, 2)
     _draw_graph(left, problem, layout)
     _draw_sparsity(right, problem, layout)
-    figure.suptitle(f"structure of {problem.name!r}")
-    return figure
+    drawing.suptitle(f"structure of {problem.name!r}")
+    return drawing
 
 
 def _edges(problem: Problem, layout: Layout) -> tuple[dict[Any, str], dict[Any, tuple[str, str]], set[Any]]:
