@@ -8,7 +8,6 @@ Source: dmhe-l-step, Algorithms (off-line), Assumptions and conditions.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Generic, TypeVar
@@ -120,7 +119,7 @@ class RelayDesign:
     ) -> None:
         if not isinstance(model, LinearModel):
             raise DefinitionError(f"distributed estimators need a LinearModel, got {model!r}")
-        self.options = options = relay_options_of(method, **overrides)
+        self.options = relay_options_of(method, **overrides)
         self.model, self.network = model, network
         self.state_bounds = state_bounds
         self.residual_bounds = residual_bounds_of(model, residual_bounds)
@@ -219,14 +218,12 @@ class RelayDesign:
     def _design_matrix(self) -> np.ndarray:
         n, given = self.model.state_size, self.options.S
         if given is None:
-            return definite("the disturbance covariance G Q G' (S of (3.16) is its inverse)", self._process())
+            what = "the disturbance covariance G Q G' (S of (3.16) is its inverse)"
+            return definite(what, self.model.process_covariance)
         S = np.asarray(given, dtype=float)
         if S.shape not in ((), (n, n)):
             raise ShapeError(f"S: expected a number or an information matrix of shape {(n, n)}, got {S.shape}")
         return np.linalg.inv(definite("S", S * np.eye(n) if S.ndim == 0 else S))
-
-    def _process(self) -> np.ndarray:
-        return self.model.process_covariance
 
     def _weights(self, matrix: Any) -> Weights:
         rule = self.options.weights

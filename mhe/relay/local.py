@@ -195,4 +195,4 @@ def block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
     """Square blocks along the diagonal; (0, 0) for none."""
     from scipy.linalg import block_diag
 
-    return block_diag(np.zeros((0, 0)), *blocks)
+    return np.asarray(block_diag(np.zeros((0, 0)), *blocks))

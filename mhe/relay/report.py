@@ -26,7 +26,8 @@ class RelayReport:
     Attributes:
         inactive: (count,) bool, no sensor.
         locally_undetectable: (count,) bool, (A, C^i).
-        regionally_undetectable: (count,) bool, A and the outputs of the node and its direct neighbours (Definition 3.3).
+        regionally_undetectable: (count,) bool, A with the outputs of the node and its direct neighbours (Definition
+            3.3).
         rank: (count,) of the information in a full window; n if it determines the state without a prior.
         own_radius: (count,) spectral radius of A - L^i C^i (of A where disturbances are estimated).
         radius: (count, l) spectral radii of Phi_s for what is within 1..l hops.
@@ -119,4 +120,4 @@ def _seeing(design: RelayDesign) -> np.ndarray:
 
 def _grows(hidden: np.ndarray) -> np.ndarray:
     # the NaN that fill up the rows compare as false
-    return (np.abs(hidden) >= 1 - EIGENVALUE_TOLERANCE).any(axis=-1)
+    return np.asarray((np.abs(hidden) >= 1 - EIGENVALUE_TOLERANCE).any(axis=-1))
