@@ -81,8 +81,8 @@ class GtsamSession(Session):
     extra: ClassVar[str | None] = None
     name: ClassVar[str]
     optimizer: ClassVar[str]
-    settings_type: ClassVar[type[Settings]]
-    nonlinear_equalities: ClassVar[bool] = False
+    settings_type: ClassVar[type]
+    nonlinear_equalities: bool = False
 
     def __init__(self, problem: Problem, options: Options) -> None:
         settings = checked_settings(self.settings_type, options.extra, self.name)
@@ -117,7 +117,7 @@ class GtsamSession(Session):
                     "violations and stalls there; use solver='gauss-newton', 'gtsam-gn' or 'ipopt'"
                 )
 
-    def _translated(self, settings: Settings) -> Any:
+    def _translated(self, settings: Any) -> Any:
         import gtsam
 
         parameters = getattr(gtsam, f"{self.optimizer}Params")()
@@ -291,10 +291,9 @@ class GraduatedNonConvexity(GtsamSession):
         # gtsam compares errors, which are half the squared norm
         self._threshold = scales.pop() ** 2 / 2
 
-    def _translated(self, settings: Settings) -> Any:
+    def _translated(self, settings: GNCSettings) -> Any:
         import gtsam
 
-        assert isinstance(settings, GNCSettings)
         inner = super()._translated(replace(settings, lambdaStep=None))
         self._graduated = gtsam.GncLMParams(inner)
         self._graduated.setLossType(gtsam.GncLossType.GM)

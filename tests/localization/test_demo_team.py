@@ -23,7 +23,7 @@ from problems.cli.main import app
 from problems.errors import AccuracyWarning, FormError
 from problems.problem import Problem
 
-GRAPH = ["gauss-newton", "ipopt", "gtsam-lm", "auto"]
+GRAPH = ["gauss-newton", "ipopt", "gtsam-lm", "gtsam-isam2", "auto"]
 QUADRATIC = ["osqp", "proxqp", "daqp"]
 PAIRS = ("one", "both")
 

@@ -65,7 +65,7 @@ def test_one_optimum_from_every_solver(robots: int) -> None:
     team = draw_lattice(robots, np.random.default_rng(robots), pairs="both")
     problem, data, start = team_problem(team), team_data(team), {"robot": linear_start(team)[0]}
     ours = problem.compile("gauss-newton", tolerance=1e-12).solve(data, initial=start)
-    for solver in ("gtsam-lm", "gtsam-gn", "gtsam-dogleg", "ipopt"):
+    for solver in ("gtsam-lm", "gtsam-gn", "gtsam-dogleg", "gtsam-isam2", "ipopt"):
         with warnings.catch_warnings():
             warnings.simplefilter("error", SlowPathWarning)
             solution = problem.compile(solver, tolerance=1e-9).solve(data, initial=start)
@@ -165,7 +165,7 @@ def pose_graph(count: int = 12) -> tuple[Problem, dict[str, Any], np.ndarray, np
     return p, {"odometry": z, "origin": truth[0]}, start, truth
 
 
-@pytest.mark.parametrize("solver", ["gtsam-lm", "gtsam-gn", "gtsam-dogleg", "ipopt"])
+@pytest.mark.parametrize("solver", ["gtsam-lm", "gtsam-gn", "gtsam-dogleg", "gtsam-isam2", "ipopt"])
 def test_pinned_pose_graphs_agree(solver: str) -> None:
     problem, data, start, truth = pose_graph()
     ours = problem.compile("gauss-newton", tolerance=1e-13).solve(data, initial={"pose": start})

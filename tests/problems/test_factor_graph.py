@@ -21,7 +21,7 @@ from problems.solvers.gtsam_solvers import GtsamSession
 from problems.spatial import SE3, SO3
 
 gtsam = pytest.importorskip("gtsam")
-OPTIMIZERS = ["gtsam-lm", "gtsam-gn", "gtsam-dogleg"]
+OPTIMIZERS = ["gtsam-lm", "gtsam-gn", "gtsam-dogleg", "gtsam-isam2"]
 LINEAR = 0.05 * np.arange(6.0)
 LOSSES = [None, Huber(0.7), Cauchy(0.8), GemanMcClure(1.5), Tukey(3.0)]
 

@@ -602,7 +602,7 @@ def test_every_way_finds_the_optimum(way: str, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.filterwarnings("ignore::problems.errors.SlowPathWarning")
-@pytest.mark.parametrize("solver", ["gtsam-lm", "gtsam-gn"])
+@pytest.mark.parametrize("solver", ["gtsam-lm", "gtsam-gn", "gtsam-isam2"])
 def test_graphs_find_the_optimum(solver: str) -> None:
     pytest.importorskip("gtsam")
     for seed in SEEDS[:8]:
