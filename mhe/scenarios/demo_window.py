@@ -19,10 +19,10 @@ import numpy as np
 import pydantic
 
 from mhe.centralized import MovingHorizonEstimator, mhe, mhe_pre
-from mhe.estimate import WindowEstimate
+from mhe.estimate import Estimate, WindowEstimate
 from mhe.filters import KalmanFilter
 from mhe.polyhedron import Polyhedron
-from problems.bench.scenario import Outcome
+from problems.bench.scenario import Consistency, Curve, Outcome
 from problems.errors import ModelWarning
 from problems.models import LinearModel, Sensor
 
@@ -61,16 +61,7 @@ class Drawn:
 
     states: np.ndarray
     measurements: np.ndarray
-    _references: dict[str, np.ndarray] = field(default_factory=dict)  # found when they are first asked for
-
-    def reference(self, settings: Settings, method: str) -> np.ndarray:
-        """States (duration + 1, 3) at the optima of the same windows, solved much more tightly."""
-        if method not in self._references:
-            exact = settings.model_copy(update={"tolerance": REFERENCE_TOLERANCE, "form": "auto", "warm": True})
-            estimator = _estimator(exact, method, "daqp")  # type: ignore[arg-type]
-            estimator.reset()
-            self._references[method] = np.array([estimator.step(y).state for y in self.measurements])
-        return self._references[method]
+    references: dict[str, np.ndarray] = field(default_factory=dict)  # found when they are first asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +100,10 @@ class DemoWindowScenario:
         estimator = _estimator(settings, method, solver)  # type: ignore[arg-type]
         compiled = perf_counter() - started
         estimator.reset()
-        estimates = [estimator.step(y) for y in drawn.measurements]
+        estimates, nees = [], []
+        for y, truth in zip(drawn.measurements, drawn.states, strict=True):
+            estimates.append(estimator.step(y))
+            nees.append(_normalized(estimates[-1], truth))  # the covariance follows from what the session holds now
         unmet = [k for k, estimate in enumerate(estimates) if estimate.infeasible]
         if unmet:
             warnings.warn(
@@ -122,21 +116,30 @@ class DemoWindowScenario:
         seconds = np.array([estimate.seconds for estimate in estimates])
         solutions = [estimate.solution for estimate in estimates if estimate.solution is not None]
         solve = sum(solution.seconds["solve"] for solution in solutions)
-        away = np.linalg.norm(states - drawn.reference(settings, method), axis=1)
         return Outcome(
-            metrics={
-                "rmse": _rmse(states, drawn),
-                "distance_to_reference": float(away.max()),
-                "active_share": float(active.mean()),
-            },
+            metrics={"rmse": _rmse(states, drawn), "active_share": float(active.mean())},
             options=estimator.options,
             times={"compile": compiled, "update": float(seconds.sum()) - solve, "solve": solve},
             step_seconds=seconds,
             status=Counter(str(estimate.status) for estimate in estimates),
             iterations=sum(solution.iterations for solution in solutions),
             residual=max(max(solution.residuals.values()) for solution in solutions),
+            curves={"error": _errors(states, drawn)},
+            consistency={} if method == "mhe_pre" else {"nees": Consistency(np.array(nees), 3)},
+            estimate=states,
             trace=Trace(states, active),
         )
+
+    def reference(self, settings: Settings, method: str, drawn: Drawn) -> np.ndarray | None:
+        """States (duration + 1, 3) at the optima of the same windows, solved much more tightly."""
+        if method == "kf":
+            return None
+        if method not in drawn.references:
+            exact = settings.model_copy(update={"tolerance": REFERENCE_TOLERANCE, "form": "auto", "warm": True})
+            estimator = _estimator(exact, method, "daqp")  # type: ignore[arg-type]
+            estimator.reset()
+            drawn.references[method] = np.array([estimator.step(y).state for y in drawn.measurements])
+        return drawn.references[method]
 
     def plot(self, settings: Settings, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
         from matplotlib.figure import Figure
@@ -196,17 +199,40 @@ def _held(estimate: WindowEstimate) -> bool:
 
 
 def _filtered(drawn: Drawn) -> Outcome:
-    estimator = KalmanFilter(_model())
-    estimates = [estimator.step(y) for y in drawn.measurements]
+    model, estimator = _model(), KalmanFilter(_model())
+    estimates, nees, nis = [], [], []
+    for k, (y, truth) in enumerate(zip(drawn.measurements, drawn.states, strict=True)):
+        mean, covariance = estimator.mean, estimator.covariance
+        if k:
+            mean, covariance = model.A @ mean, model.A @ covariance @ model.A.T + model.process_covariance
+        nis.append(_squared(y - model.C @ mean, model.C @ covariance @ model.C.T + model.R))
+        estimates.append(estimator.step(y))
+        nees.append(_normalized(estimates[-1], truth))
     states = np.array([estimate.state for estimate in estimates])
     seconds = np.array([estimate.seconds for estimate in estimates])
     return Outcome(
-        metrics={"rmse": _rmse(states, drawn), "distance_to_reference": None, "active_share": None},
+        metrics={"rmse": _rmse(states, drawn), "active_share": None},
         times={"solve": float(seconds.sum())},
         step_seconds=seconds,
         status=Counter(str(estimate.status) for estimate in estimates),
+        curves={"error": _errors(states, drawn)},
+        consistency={"nees": Consistency(np.array(nees), 3), "nis": Consistency(np.array(nis), 2)},
         trace=Trace(states, np.zeros(len(states), dtype=bool)),
     )
+
+
+def _normalized(estimate: Estimate, truth: np.ndarray) -> float:
+    """Squared error in units of the covariance; NaN where there is none."""
+    covariance = estimate.covariance
+    return np.nan if covariance is None else _squared(estimate.state - truth, covariance)
+
+
+def _squared(error: np.ndarray, covariance: np.ndarray) -> float:
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def _errors(states: np.ndarray, drawn: Drawn) -> Curve:
+    return Curve(np.linalg.norm(states - drawn.states, axis=1))
 
 
 def _rmse(states: np.ndarray, drawn: Drawn) -> float:

@@ -96,6 +96,18 @@ def paired_difference(
     return Difference(mean, mean - half, mean + half, count)
 
 
+def chi_square_interval(degrees: float, confidence: float = 0.95) -> tuple[float, float]:
+    """The interval that holds a chi-square variable with this probability, equal tails outside.
+
+    The mean of a squared normalized error with d degrees of freedom over m independent trials lies, where the covariance
+    is right, in ``chi_square_interval(m * d)`` divided by m.
+    """
+    from scipy.special import chdtri
+
+    tail = (1 - confidence) / 2
+    return float(chdtri(degrees, 1 - tail)), float(chdtri(degrees, tail))
+
+
 def solved_share(status: Mapping[str, int]) -> float | None:
     """Share of steps that were solved to the tolerance asked for; None without steps."""
     steps = sum(status.values())

@@ -1,7 +1,7 @@
 """Rows as a Parquet table: one table row a job, the sessions in the metadata of the schema.
 
 Dictionaries of numbers are spread over dotted columns (`metrics.rmse`, `times.solve`, `status.solved`); settings,
-options and warnings, whose types differ from scenario to scenario, are JSON text. In `metrics.*` null means that the
+options, warnings, curves and consistency, whose types or keys differ from scenario to scenario, are JSON text. In `metrics.*` null means that the
 row has no such metric and NaN that the metric has no value.
 """
 
@@ -32,6 +32,7 @@ _PLAIN = {
     "cpu": "float64",
     "memory": "int64",
 }
+_TEXT = ("options", "warnings", "curves", "consistency")
 _FAILURE = ("kind", "message", "traceback")
 
 
@@ -86,8 +87,7 @@ def _arrow_type(name: str) -> Any:
 def _flatten(row: Row) -> dict[str, Any]:
     record: dict[str, Any] = {name: getattr(row.job, name) for name in _JOB}
     record["settings"] = json.dumps(row.job.settings)
-    record["options"] = json.dumps(row.options)
-    record["warnings"] = json.dumps(row.warnings)
+    record |= {name: json.dumps(getattr(row, name)) for name in _TEXT}
     record |= {name: getattr(row, name) for name in _PLAIN}
     record |= {f"metrics.{name}": math.nan if value is None else value for name, value in row.metrics.items()}
     for part in ("times", "status"):
@@ -106,10 +106,9 @@ def _row(record: dict[str, Any]) -> Row:
     return Row(
         job=job,
         metrics=metrics,
-        options=json.loads(record["options"]),
         times=spread["times"],
         status=spread["status"],
-        warnings=json.loads(record["warnings"]),
         failure=Failure(**spread["failure"]) if spread["failure"] else None,
+        **{name: json.loads(record[name]) for name in _TEXT},
         **{name: record[name] for name in _PLAIN},
     )

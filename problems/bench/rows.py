@@ -9,6 +9,10 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
+from problems.errors import FormError, NotAffineError
+
+IMPOSSIBLE = (FormError.__name__, NotAffineError.__name__)  # kinds of failures that say a pairing does not exist
+
 
 @dataclass(frozen=True)
 class Job:
@@ -52,6 +56,9 @@ class Row:
         status: steps by status name.
         iterations: solver iterations of all steps.
         residual: worst recomputed residual.
+        curves: {"at", "values", "over"} by name, thinned to at most `problems.bench.measure.POINTS` points.
+        consistency: {"mean", "inside", "degrees", "samples"} by name: mean of the squared normalized errors per degree
+            of freedom (1 where the covariance is right), and the share of them in the interval that holds 95 % then.
         wall, cpu: seconds of the whole trial, without drawing it.
         memory: bytes the peak of the process's memory grew by during the trial; None where the system does not tell.
         warnings: distinct warnings raised on the way.
@@ -69,6 +76,8 @@ class Row:
     status: dict[str, int] = field(default_factory=dict)
     iterations: int = 0
     residual: float | None = None
+    curves: dict[str, dict[str, Any]] = field(default_factory=dict)
+    consistency: dict[str, dict[str, float]] = field(default_factory=dict)
     wall: float | None = None
     cpu: float | None = None
     memory: int | None = None
@@ -79,6 +88,11 @@ class Row:
         """JSON types only; `from_dict` reads it back."""
         record = _shallow(self) | {"job": _shallow(self.job)}
         return record | {"failure": _shallow(self.failure) if self.failure else None}
+
+    @property
+    def impossible(self) -> bool:
+        """Whether the solver cannot take the problem at all, so that there is nothing to measure or to try again."""
+        return self.failure is not None and self.failure.kind in IMPOSSIBLE
 
     @staticmethod
     def from_dict(record: dict[str, Any]) -> Row:

@@ -15,6 +15,38 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A quantity followed through a trial; the report draws it with the band of all trials.
+
+    Attributes:
+        values: (points,) what is followed; NaN where it does not exist.
+        at: (points,) where, ascending; None counts them from 0.
+        over: what `at` is, with its unit.
+    """
+
+    values: np.ndarray
+    at: np.ndarray | None = None
+    over: str = "time step"
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """Errors weighed with the covariance that was claimed for them, one for each step.
+
+    A normalized estimation error squared (NEES) is e' P^-1 e with the error e of an estimate; a normalized innovation
+    squared (NIS) is the same of a predicted measurement. Both are chi-square distributed with `degrees` degrees of
+    freedom where the covariance is right (Bar-Shalom, Li, Kirubarajan: Estimation with Applications, 5.4).
+
+    Attributes:
+        squared: (steps,) the squares; NaN where there is no covariance.
+        degrees: of freedom, the length of e.
+    """
+
+    squared: np.ndarray
+    degrees: int
+
+
 @dataclass
 class Outcome:
     """What one method did in one trial.
@@ -28,6 +60,9 @@ class Outcome:
         status: steps by status name (`problems.solvers.base.Status`).
         iterations: solver iterations of all steps.
         residual: the worst residual the sessions recomputed; None where nothing was solved.
+        curves: followed through the trial, by name.
+        consistency: squared normalized errors by name ("nees", "nis").
+        estimate: what is compared with `Scenario.reference`, an array of the same shape.
         trace: whatever the scenario's own plot needs; must be picklable.
     """
 
@@ -38,10 +73,14 @@ class Outcome:
     status: Counter[str] = field(default_factory=Counter)
     iterations: int = 0
     residual: float | None = None
+    curves: Mapping[str, Curve] = field(default_factory=dict)
+    consistency: Mapping[str, Consistency] = field(default_factory=dict)
+    estimate: np.ndarray | None = None
     trace: Any = None
 
 
 TIMES = ("compile", "setup", "update", "solve")
+DISTANCE = "distance_to_reference"  # the metric that comes from `Scenario.reference`
 
 
 class Scenario(Protocol):
@@ -56,6 +95,11 @@ class Scenario(Protocol):
 
     A scenario with methods that solve no optimization problem (a Kalman filter) also has ``without_solver``, a tuple
     of their names; a plan then gives them one row instead of one for each solver.
+
+    A scenario that knows the optimum of what its methods solve has ``reference(settings, method, drawn) -> array``: the
+    `Outcome.estimate` of the same problem solved far more tightly, or None for a method without one. The benchmark
+    calls it outside of the measured time and adds the metric `DISTANCE`, the largest distance of a row of the estimate
+    from that of the reference.
     """
 
     name: str

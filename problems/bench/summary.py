@@ -28,10 +28,12 @@ class Summary:
         options: the method's set of options.
         trials: how many were run.
         failed: how many of them raised, crashed or took too long.
+        impossible: how many did not run because the solver cannot take the problem.
         metrics: mean over the finished trials by name; None where no trial has a value.
         metrics_se: standard error of the mean; None with fewer than two values.
         time: medians over the finished trials, in seconds: `TIMES` per trial, `step_median` and `step_p95` per step.
-        cpu: median CPU seconds of a trial.
+        step_max: seconds of the longest step of all trials.
+        wall, cpu: median seconds of a trial.
         memory: median growth of the peak memory in bytes.
         status: steps of all trials by status name, all names; a failed trial counts as one failed step.
         iterations: mean over the finished trials.
@@ -46,9 +48,12 @@ class Summary:
     options: dict[str, Any]
     trials: int
     failed: int
+    impossible: int
     metrics: dict[str, float | None]
     metrics_se: dict[str, float | None]
     time: dict[str, float | None]
+    step_max: float | None
+    wall: float | None
     cpu: float | None
     memory: float | None
     status: dict[str, int]
@@ -92,11 +97,14 @@ def _summary(rows: Sequence[Row]) -> Summary:
         seed=job.seed,
         options=done[0].options if done else {},
         trials=len(rows),
-        failed=len(rows) - len(done),
+        failed=sum(row.failure is not None and not row.impossible for row in rows),
+        impossible=sum(row.impossible for row in rows),
         metrics={name: mean for name, (mean, _) in statistics.items()},
         metrics_se={name: error for name, (_, error) in statistics.items()},
         time={name: _median([row.times.get(name) for row in done]) for name in TIMES}
         | {name: _median([getattr(row, name) for row in done]) for name in STEP_TIMES},
+        step_max=max((row.step_max for row in done if row.step_max is not None), default=None),
+        wall=_median([row.wall for row in done]),
         cpu=_median([row.cpu for row in done]),
         memory=_median([row.memory for row in done]),
         status=dict(status),

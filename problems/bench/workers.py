@@ -1,7 +1,4 @@
-"""Run jobs in worker processes of one thread each.
-
-`run_jobs` is the whole interface between a campaign and what executes it: jobs in, rows out, in any order.
-"""
+"""What executes jobs: one small interface, and the processes of this machine behind it."""
 
 from __future__ import annotations
 
@@ -12,8 +9,9 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, Protocol
 
 from problems.bench.measure import failure_of, measure
 from problems.bench.rows import Failure, Job, Row
@@ -31,26 +29,54 @@ AHEAD = 2  # jobs handed to a worker at a time: the next one starts while the ro
 Result = tuple[Row, Outcome | None]
 
 
-def run_jobs(
-    jobs: Sequence[Job], workers: int = 1, time_limit: float | None = None, keep: Collection[str] = ()
-) -> Iterator[Result]:
-    """Run jobs and yield their rows as they finish.
+class Executor(Protocol):
+    """The whole interface between a campaign and what executes it: jobs in, rows out, in any order.
 
-    Args:
-        jobs: what to run; jobs of the same trial stand next to each other, so that a worker draws it once.
-        workers: number of processes; 0 runs the jobs in this process, without time limit and protection from crashes.
-        time_limit: seconds of one job; a worker that takes longer is killed and its job fails.
-        keep: keys of the jobs of which not only the row but all that the scenario returned is wanted.
-
-    Yields:
-        The row of each job and, where it is wanted and there is one, the outcome. A job that raises, crashes its
-        process or takes too long costs its own row only.
+    Attributes:
+        workers: number of processes, as the report names it.
     """
-    if workers == 0:
+
+    @property
+    def workers(self) -> int: ...
+
+    def run(self, jobs: Sequence[Job], time_limit: float | None = None, keep: Collection[str] = ()) -> Iterator[Result]:
+        """Run jobs and yield their rows as they finish.
+
+        Args:
+            jobs: what to run; jobs of the same trial stand next to each other, so that a worker draws it once.
+            time_limit: seconds of one job; a job that takes longer is stopped and fails.
+            keep: keys of the jobs of which not only the row but all that the scenario returned is wanted.
+
+        Yields:
+            The row of each job and, where it is wanted and there is one, the outcome. A job that raises, crashes its
+            process or takes too long costs its own row only.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class LocalProcesses:
+    """Processes of one thread each on this machine.
+
+    Attributes:
+        workers: how many; 0 runs the jobs in this process, without time limit and protection from crashes.
+    """
+
+    workers: int = 1
+
+    def run(self, jobs: Sequence[Job], time_limit: float | None = None, keep: Collection[str] = ()) -> Iterator[Result]:
+        """See `Executor`."""
+        if self.workers:
+            yield from _in_processes(jobs, self.workers, time_limit, keep)
+            return
         for job in jobs:
             row, outcome = measure(job)
             yield row, outcome if job.key in keep else None
-        return
+
+
+def _in_processes(
+    jobs: Sequence[Job], workers: int, time_limit: float | None, keep: Collection[str]
+) -> Iterator[Result]:
     context = multiprocessing.get_context("spawn")
     pending = deque(jobs)
     with _one_thread_each():

@@ -15,6 +15,7 @@ from problems.bench.run import missing, run_plan
 from problems.bench.settings import assignments, describe, split
 from problems.bench.store import Store, load
 from problems.bench.summary import summarize
+from problems.bench.workers import LocalProcesses
 from problems.cli.output import error_console, one_json_object, print_failures, print_summaries
 from problems.cli.progress import progress
 from problems.errors import SettingError
@@ -83,7 +84,7 @@ def run_campaign(plan: Plan, folder: Path, workers: int, fresh: bool = False) ->
                 f"{len(jobs) - len(left)} of {len(jobs)} rows are in {folder} already", soft_wrap=True
             )
         try:
-            for _ in progress(run_plan(plan, store, workers), len(left), plan.name):
+            for _ in progress(run_plan(plan, store, LocalProcesses(workers)), len(left), plan.name):
                 pass
         except KeyboardInterrupt:
             error_console().print("stopped; the same command goes on where it was", soft_wrap=True)

@@ -14,7 +14,7 @@ from problems.bench.rows import Job, Row
 from problems.bench.scenario import Outcome, Scenario, trial_rng
 from problems.bench.settings import assignments, complete, describe, validated
 from problems.bench.summary import summarize
-from problems.bench.workers import run_jobs
+from problems.bench.workers import LocalProcesses
 from problems.cli.output import error_console, one_json_object, print_failures, print_summaries
 from problems.cli.progress import progress
 from problems.errors import WriteError
@@ -55,7 +55,7 @@ def _run(plan: Plan, first_trial: bool) -> tuple[list[Row], dict[str, Outcome]]:
     jobs = plan.jobs()
     keep = [job.key for job in jobs if job.trial == 0] if first_trial else []
     rows, outcomes = [], {}
-    for row, outcome in progress(run_jobs(jobs, keep=keep), len(jobs), plan.study[0].scenario):
+    for row, outcome in progress(LocalProcesses().run(jobs, keep=keep), len(jobs), plan.study[0].scenario):
         rows.append(row)
         if outcome is not None:
             outcomes[row.job.method] = outcome

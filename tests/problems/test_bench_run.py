@@ -15,7 +15,7 @@ from problems.bench.rows import Job, Row
 from problems.bench.run import missing, run_plan
 from problems.bench.scenario import Outcome, trial_rng
 from problems.bench.store import Store
-from problems.bench.workers import run_jobs
+from problems.bench.workers import LocalProcesses
 
 pytestmark = pytest.mark.usefixtures("toy_package")
 
@@ -42,7 +42,7 @@ def test_the_noise_of_a_trial_depends_on_seed_scenario_and_trial_only() -> None:
 
 def test_methods_solvers_and_settings_of_a_trial_meet_the_same_noise() -> None:
     jobs = plan(trials=1, solvers=("swift", "slow"), settings={"tolerance": [1e-3, 1e-6]}).jobs()
-    kept = [outcome for _, outcome in run_jobs(jobs, workers=0, keep=[job.key for job in jobs])]
+    kept = [outcome for _, outcome in LocalProcesses(0).run(jobs, keep=[job.key for job in jobs])]
     traces = [outcome.trace for outcome in kept if outcome is not None]
     assert len(traces) == len(kept) == 10
     assert all(np.array_equal(trace, traces[0]) for trace in traces)
@@ -64,7 +64,7 @@ def test_a_row_holds_what_the_scenario_reported() -> None:
     ("mode", "message"), [("raise", "ArithmeticError: the estimate diverged"), ("exit", "SystemExit: 3")]
 )
 def test_an_estimator_that_raises_costs_its_row_only(mode: str, message: str) -> None:
-    rows = [row for row, _ in run_jobs(plan(settings={"mode": mode}).jobs(), workers=0)]
+    rows = [row for row, _ in LocalProcesses(0).run(plan(settings={"mode": mode}).jobs())]
     failed = [row for row in rows if row.failure]
     assert [row.job.method for row in failed] == ["first", "first"]
     assert len(rows) == 6
@@ -103,8 +103,8 @@ def test_nan_is_no_value(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.serial
 def test_processes_and_this_process_give_the_same_rows() -> None:
     jobs = plan(trials=5, settings={"mode": ["calm", "raise"]}).jobs()
-    here = {row.job.key: without_times(row) for row, _ in run_jobs(jobs, workers=0)}
-    there = {row.job.key: without_times(row) for row, _ in run_jobs(jobs, workers=2)}
+    here = {row.job.key: without_times(row) for row, _ in LocalProcesses(0).run(jobs)}
+    there = {row.job.key: without_times(row) for row, _ in LocalProcesses(2).run(jobs)}
     assert here.keys() == there.keys()
     for key, row in here.items():
         for record in (row, there[key]):
@@ -116,7 +116,7 @@ def test_processes_and_this_process_give_the_same_rows() -> None:
 @pytest.mark.parametrize(("mode", "reason"), [("crash", "SIGSEGV"), ("hang", "time limit of 2 s")])
 def test_a_worker_that_dies_or_hangs_costs_its_row_only(mode: str, reason: str) -> None:
     jobs = plan(trials=1, settings={"mode": mode, "steps": [3, 4]}).jobs()
-    rows = {row.job.key: row for row, _ in run_jobs(jobs, workers=1, time_limit=2.0)}
+    rows = {row.job.key: row for row, _ in LocalProcesses(1).run(jobs, time_limit=2.0)}
     assert len(rows) == len(jobs) == 6
     for row in rows.values():
         assert (row.failure is not None) == (row.job.method == "first")
@@ -126,7 +126,7 @@ def test_a_worker_that_dies_or_hangs_costs_its_row_only(mode: str, reason: str) 
 @pytest.mark.serial
 def test_only_the_outcomes_that_are_wanted_cross_the_process_boundary() -> None:
     jobs = plan(trials=2, methods=("mean",)).jobs()
-    kept = {row.job.trial: outcome for row, outcome in run_jobs(jobs, workers=1, keep=[jobs[0].key])}
+    kept = {row.job.trial: outcome for row, outcome in LocalProcesses(1).run(jobs, keep=[jobs[0].key])}
     assert kept[0] is not None
     assert np.array_equal(kept[0].trace, trial_rng(0, "toy", 0).normal(size=4))
     assert kept[1] is None
@@ -135,7 +135,7 @@ def test_only_the_outcomes_that_are_wanted_cross_the_process_boundary() -> None:
 @pytest.mark.serial
 def test_an_outcome_that_cannot_be_sent_is_a_failure_of_its_row() -> None:
     jobs = plan(trials=1, settings={"mode": "unpicklable"}).jobs()
-    rows = {row.job.method: row for row, _ in run_jobs(jobs, workers=1, keep=[job.key for job in jobs])}
+    rows = {row.job.method: row for row, _ in LocalProcesses(1).run(jobs, keep=[job.key for job in jobs])}
     assert rows["mean"].failure is None
     assert rows["first"].failure is not None
     assert "pickle" in rows["first"].failure.message
@@ -146,7 +146,7 @@ def test_workers_have_one_thread_and_leave_the_environment_as_it_was(monkeypatch
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     seen = []
-    for row, _ in run_jobs(plan(trials=1, methods=("mean",)).jobs(), workers=1):
+    for row, _ in LocalProcesses(1).run(plan(trials=1, methods=("mean",)).jobs()):
         seen.append((row.failure, os.environ["OMP_NUM_THREADS"]))
     assert seen == [(None, "1")]
     assert os.environ["OMP_NUM_THREADS"] == "7"
@@ -156,16 +156,16 @@ def test_workers_have_one_thread_and_leave_the_environment_as_it_was(monkeypatch
 def test_a_second_run_repeats_only_what_failed(tmp_path: Path) -> None:
     todo = plan(trials=3, settings={"mode": "raise"})
     with Store(tmp_path) as store:
-        first = list(run_plan(todo, store, workers=0))
+        first = list(run_plan(todo, store, LocalProcesses(0)))
     with Store(tmp_path) as store:
-        second = list(run_plan(todo, store, workers=0))
+        second = list(run_plan(todo, store, LocalProcesses(0)))
     assert len(first) == 9
     assert [row.job.method for row in second] == ["first"] * 3
 
 
 def test_more_trials_of_the_same_plan_add_to_it(tmp_path: Path) -> None:
     with Store(tmp_path) as store:
-        list(run_plan(plan(trials=2), store, workers=0))
+        list(run_plan(plan(trials=2), store, LocalProcesses(0)))
     with Store(tmp_path) as store:
         jobs = plan(trials=4).jobs()
         assert [job.trial for job in missing(jobs, store)] == [2] * 3 + [3] * 3

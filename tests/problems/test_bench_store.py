@@ -20,6 +20,7 @@ from problems.bench.plan import Plan, Study
 from problems.bench.rows import Row
 from problems.bench.run import run_plan
 from problems.bench.store import JOURNAL, Store, load
+from problems.bench.workers import LocalProcesses
 from problems.errors import ReadError, WriteError
 
 pytestmark = pytest.mark.usefixtures("toy_package")
@@ -32,7 +33,7 @@ def plan(trials: int = 3, mode: str = "raise") -> Plan:
 
 def filled(folder: Path) -> list[Row]:
     with Store(folder) as store:
-        return list(run_plan(plan(), store, workers=0))
+        return list(run_plan(plan(), store, LocalProcesses(0)))
 
 
 def test_parquet_gives_back_the_rows_of_the_journal(tmp_path: Path) -> None:
@@ -65,7 +66,7 @@ def test_half_a_line_at_the_end_is_dropped(tmp_path: Path) -> None:
     journal.write_bytes(whole[:-20])
     assert load(tmp_path).rows == rows[:-1]
     with Store(tmp_path) as store:
-        again = list(run_plan(plan(), store, workers=0))
+        again = list(run_plan(plan(), store, LocalProcesses(0)))
     lost = [row.job.key for row in rows[-1:]]
     failed = [row.job.key for row in rows if row.failure]
     assert sorted(row.job.key for row in again) == sorted({*lost, *failed})
@@ -119,7 +120,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path, folder: str) -> None:
 def test_a_full_disk_is_refused_before_work_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=2**20))
     with Store(tmp_path) as store, pytest.raises(WriteError, match="1 MiB are free, 39 rows need 16 MiB"):
-        next(run_plan(plan(), store, workers=0))
+        next(run_plan(plan(), store, LocalProcesses(0)))
 
 
 def test_a_disk_that_fills_up_on_the_way_keeps_what_was_written(tmp_path: Path) -> None:

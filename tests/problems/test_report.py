@@ -25,6 +25,7 @@ from problems.bench.rows import Failure, Job, Row
 from problems.bench.run import run_plan
 from problems.bench.store import Results, Store, load
 from problems.bench.summary import reproduce, summarize
+from problems.bench.workers import LocalProcesses
 
 pytestmark = pytest.mark.usefixtures("toy_package")
 
@@ -43,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, toy_package: Path) -> Path:
         name="toys & others", text="First part\nof the text.\n\nSecond <part>.", study=(toy, Study(scenario="other"))
     )
     with Store(out) as store:
-        for _ in run_plan(plan.model_copy(update={"trials": 6}), store, workers=0):
+        for _ in run_plan(plan.model_copy(update={"trials": 6}), store, LocalProcesses(0)):
             pass
         job = Job("other", "mean", "auto", {"steps": 9}, 0, 0)
         store.append(Row(job, failure=Failure("ValueError", NASTY, "Traceback"), status={"failed": 1}))
