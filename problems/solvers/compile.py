@@ -18,6 +18,7 @@ from problems.forms.affine import require_affine
 from problems.forms.quadratic import QuadraticProgram
 from problems.problem import Problem
 from problems.solvers.base import Options
+from problems.solvers.qp_code import CodeSession
 from problems.solvers.qp_empty import require_nonempty
 from problems.solvers.qp_session import QPSession
 from problems.solvers.qp_support import Backend, checked_settings
@@ -25,6 +26,7 @@ from problems.solvers.session import Session
 
 ALIASES = {"gtsam": "gtsam-lm"}
 FORMS = ("quadratic", "nonlinear", "graph")
+ASSEMBLIES = {"maps": QPSession, "code": CodeSession}
 
 
 def compile_problem(
@@ -80,13 +82,16 @@ def _quadratic(
     program = QuadraticProgram(problem, eliminate)
     require_nonempty(program)
     screen = bool(settings.pop("screen", backend is None))
+    assembly = settings.pop("assembly", "maps")
+    if assembly not in ASSEMBLIES:
+        raise UnknownNameError("assembly", str(assembly), ASSEMBLIES)
     warm = bool(settings.pop("warm", True))
     if backend is None:
-        backend = registry.load("solvers", "daqp" if program.dense else "proxqp")
+        backend = registry.load("solvers", "daqp" if program.dense or assembly == "code" else "proxqp")
     options = options_of(settings)
     if issubclass(backend, Backend):  # a screened session may need its backend late or never
         checked_settings(backend.settings_type, options.extra, backend.name)
-    return QPSession(program, solver, backend, options, screen, warm)
+    return ASSEMBLIES[assembly](program, solver, backend, options, screen, warm)
 
 
 def is_affine(problem: Problem) -> bool:

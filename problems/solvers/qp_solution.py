@@ -20,12 +20,25 @@ from problems.solvers.qp_rows import StackedRows
 NEGLIGIBLE = 1e-13  # a gap so small needs no comparison with the objective
 
 
+class Pattern:
+    """What a check keeps of one solve: the active instances, worked out on access."""
+
+    def __init__(self, program: QuadraticProgram, numbers: np.ndarray, flags: dict[str, Any] | None) -> None:
+        self._program, self._numbers, self._flags = program, numbers, flags
+        self.rows: StackedRows | None = None
+
+    @property
+    def flags(self) -> dict[str, Any]:
+        return self._program.flags(self._numbers) if self._flags is None else self._flags
+
+
 class QPCheck:
     """Implements `problems.solvers.session.Check`.
 
     Args:
         numbers: data of the solve, missing ones read as zero.
-        map_: for the weights and the pattern of that solve; keeps the stacked rows for all its solutions.
+        map_: for the weights and the pattern of that solve, or its pattern alone; keeps the stacked rows for all its
+            solutions.
         z: all unknowns.
         mu: multipliers of all inequality rows; None where no row was active.
         violation: largest violation of a bound where `map_` itself gave the answer, else None.
@@ -38,7 +51,7 @@ class QPCheck:
         program: QuadraticProgram,
         store: DataStore,
         numbers: np.ndarray,
-        map_: DenseMap | SparseMap,
+        map_: DenseMap | SparseMap | Pattern,
         z: np.ndarray,
         mu: np.ndarray | None,
         violation: float | None = None,

@@ -1,0 +1,106 @@
+"""`CodeSession`: the quadratic form assembled anew in every solve, for weights and matrices that always change."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotrs  # type: ignore[attr-defined]
+
+from problems.errors import MissingExtraError, SettingError
+from problems.forms.quadratic import clean
+from problems.forms.quadratic_code import Assembled, QuadraticCode
+from problems.solvers.base import QPResult, Status
+from problems.solvers.qp_check import judge
+from problems.solvers.qp_maps import INDEPENDENT
+from problems.solvers.qp_session import QPSession
+from problems.solvers.qp_solution import Pattern, QPCheck
+from problems.solvers.session import Solution
+
+
+class CodeSession(QPSession):
+    """See `Session`; made by ``Problem.compile(..., assembly="code")``. Dense, for small problems.
+
+    Rows that are switched off do not reach the backend. It is built once for each number of rows and updated then.
+    """
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self.code = QuadraticCode(self.program)
+
+    def _set(self, name: str, value: Any) -> None:
+        self.store.set(name, value)
+
+    def _update(self) -> None:
+        return
+
+    def _solve(self) -> Solution:
+        numbers, flags = self.store.numbers, None
+        if not numbers.dot(numbers) < np.inf:
+            self.store.require_finite()
+            if np.isnan(numbers).any():
+                flags = self.program.flags(numbers)
+            numbers = clean(numbers)
+        program = self.code(numbers, flags)
+        if self.screens and not self.code.equalities:
+            found = self._unconstrained(program)
+            if found is not None:
+                return self._solution(program, numbers, flags, found, None, Status.SOLVED, "linear")
+        return self._constrained(program, numbers, flags)
+
+    def _unconstrained(self, program: Assembled) -> np.ndarray | None:
+        """The minimiser without inequalities, where it is unique and meets them."""
+        factor, info = dpotrf(program.P, lower=1)
+        if info or not (np.diagonal(factor) ** 2 > INDEPENDENT * np.diagonal(program.P)).all():
+            return None
+        v = dpotrs(factor, -program.q, lower=1)[0]
+        if program.l.size:
+            rows = program.A.dot(v)
+            tolerance = self.options.tolerance
+            if (rows > program.u + tolerance).any() or (rows < program.l - tolerance).any():
+                return None
+        return v
+
+    def _constrained(self, program: Assembled, numbers: np.ndarray, flags: Any) -> Solution:
+        used = (program.l > -np.inf) | (program.u < np.inf)
+        A, l, u = program.A[used], program.l[used], program.u[used]
+        result = self._backend_call(program.P, program.q, A, l, u)
+        status, result = judge(result, program.P, program.q, A, l, u, self.options.tolerance)
+        iterations, message = result.iterations, result.message
+        if result.x is None or result.y is None or not np.isfinite(result.x).all():
+            point = self.layout.identity() if self._point is None else self._point
+            check = self._check(numbers, flags, point, None)
+            return Solution(self.layout, point, status, self.solver, check, iterations, message)
+        multipliers = np.zeros(used.size)
+        multipliers[used] = result.y
+        mu = multipliers[self.code.equalities :]
+        return self._solution(program, numbers, flags, result.x, mu, status, self.solver, iterations, message)
+
+    def _solution(
+        self,
+        program: Assembled,
+        numbers: np.ndarray,
+        flags: Any,
+        v: np.ndarray,
+        mu: np.ndarray | None,
+        status: Status,
+        method: str,
+        iterations: int = 0,
+        message: str = "",
+    ) -> Solution:
+        z = program.Z.dot(v)
+        z += program.offset
+        return Solution(self.layout, z, status, method, self._check(numbers, flags, z, mu), iterations, message)
+
+    def _check(self, numbers: np.ndarray, flags: Any, point: np.ndarray, mu: np.ndarray | None) -> QPCheck:
+        kept = numbers.copy()
+        return QPCheck(self.program, self.store, kept, Pattern(self.program, kept, flags), point, mu)
+
+    def _backend_call(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, l: np.ndarray, u: np.ndarray) -> QPResult:
+        try:
+            backend = self._backend_type(P, q, A, l, u, self.options)
+            return backend.solve(q, l, u)
+        except (SettingError, MissingExtraError):
+            raise
+        except Exception as error:  # a backend that breaks is a status
+            return QPResult(None, None, Status.FAILED, 0, f"{self.solver} raised {type(error).__name__}: {error}")
