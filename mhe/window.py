@@ -41,19 +41,23 @@ class Window:
     for quadratic programs only; F2 needs a square, nonsingular disturbance gain G.
 
     Data of the problem, by name: ``y`` ((N + 1) p, NaN where missing, time first), ``u`` (N + 1, m; row k acted up to
-    slot k), ``parameters`` (r, where they are not estimated), ``filled`` (N + 1 flags, where there are bounds),
-    ``reference`` (k,), ``information`` (k, k) and ``linear`` (k,) of the arrival cost, k = n or n + r. Variables:
-    ``x``, in F1 and F3 ``w``, ``parameters`` where they are estimated, slacks where bounds are soft.
+    slot k), ``parameters`` (r, where they are not estimated), ``filled`` (N + 1 flags, where states or disturbances
+    have bounds), ``gain`` (N, n, p; row k of the transition from slot k, where it is data), ``reference`` (k,),
+    ``information`` (k, k) and ``linear`` (k,) of the arrival cost, k = n or n + r. Variables: ``x``, in F1 and F3
+    ``w``, ``parameters`` where they are estimated, slacks where bounds are soft.
 
     Args:
         model: any model; its sensors are those of a node, of a region or of the whole network.
         horizon: N >= 1 transitions.
         form: one of `WindowForm`; by default F2 where G allows it, else F3 or F1, and P2 or P1, whichever the solver
             takes.
-        gain: L (n, p) of the pre-estimation observer; None estimates the disturbances.
+        gain: L (n, p) of the pre-estimation observer, or ``"data"`` for one per transition that is data of the
+            problem; None estimates the disturbances.
         losses: robust losses by sensor name.
         state_bounds: of the states in all filled slots.
         disturbance_bounds: of the disturbances between filled slots (of L (y - h) with pre-estimation).
+        residual_bounds: of the residuals y_k - h(x_k) of sensors by name, in the slots in which all components of the
+            sensor are there.
         estimate_parameters: the parameters are unknowns, constant over the window.
         penalty: weight of the slacks of soft bounds, per unit of violation; None keeps the bounds hard. It is exact
             while it exceeds every multiplier of the hard problem.
@@ -78,6 +82,7 @@ class Window:
         losses: Mapping[str, Loss] | None = None,
         state_bounds: Polyhedron | None = None,
         disturbance_bounds: Polyhedron | None = None,
+        residual_bounds: Mapping[str, Polyhedron] | None = None,
         estimate_parameters: bool = False,
         penalty: float | None = None,
     ) -> None:
@@ -88,7 +93,9 @@ class Window:
         if estimate_parameters and not model.parameter_size:
             raise SettingError("the model has no parameters to estimate")
         self.model, self.horizon = model, int(horizon)
-        self.gain = None if gain is None else _gain(gain, model)
+        self.gain: Any = gain if gain is None or isinstance(gain, str) else _gain(gain, model)
+        if isinstance(gain, str) and gain != "data":
+            raise UnknownNameError("gain", gain, ["data"])
         self.form: WindowForm | None = self._statement(form)
         self.penalty = penalty
         self.problem = Problem(f"window of {self.horizon} transitions")
@@ -104,6 +111,9 @@ class Window:
             self._y = self.problem.data("y", (), absent.size, value=absent)
         self._u: Data | None = self.problem.data("u", m, N + 1, value=np.zeros((N + 1, m))) if m else None
         self._p: Data | None = self.problem.data("parameters", r) if r and not estimate_parameters else None
+        self._gain: Data | None = None
+        if isinstance(gain, str) and model.measurement_size:
+            self._gain = self.problem.data("gain", (n, model.measurement_size), N)
         self._arrival()
         for name in losses or {}:
             model.rows(name)
@@ -119,6 +129,9 @@ class Window:
         if disturbance_bounds is not None:
             disturbance_bounds.warn_without_origin("disturbance bounds")
             self._bound("disturbance", disturbance_bounds, n if gain is not None else model.disturbance_size)
+        for name, polyhedron in (residual_bounds or {}).items():
+            polyhedron.warn_without_origin(f"bounds of the residuals of sensor {name!r}")
+            self._bound_residuals(name, polyhedron)
 
     def compile(self, solver: str = "auto", **settings: Any) -> Session:
         """A session for the window; arguments and errors as for `Problem.compile`.
@@ -162,7 +175,7 @@ class Window:
         return tuple(
             f"{name} bounds"
             for name in self.bounds
-            if solution[f"{name} bounds slack"][: slots[name]].max(initial=0.0) > VIOLATED
+            if solution[f"{name} bounds slack"][: slots.get(name, filled)].max(initial=0.0) > VIOLATED
         )
 
     def used(self, measurements: np.ndarray) -> np.ndarray:
@@ -282,12 +295,11 @@ class Window:
     def _moved(self, x: Any, u: Any = None, p: Any = None) -> Any:
         return self.model.step(x, u, p)
 
-    def _observed(self, x: Any, y: Any, u: Any = None, p: Any = None) -> Any:
+    def _observed(self, gain: Any, x: Any, y: Any, u: Any = None, p: Any = None) -> Any:
         """L (y - h(x)) with the components that are there; `y` holds measurements, then presence flags."""
         size = self.model.measurement_size
         innovation = self.model.residual(y[:size], _predicted(self.model, x, u, p))
-        assert self.gain is not None
-        return ca.DM(self.gain) @ (y[size:] * innovation)
+        return gain @ (y[size:] * innovation)
 
     def _transitions(self) -> None:
         inputs = {"u": self._u[1:]} if self._u is not None else {}
@@ -326,11 +338,16 @@ class Window:
 
     def _observer(self, inputs: dict[str, Any]) -> None:
         data, measured = self._innovation_data(inputs)
+        fixed = None if isinstance(self.gain, str) else ca.DM(self.gain)
+        if self._gain is not None:
+            data = data | {"gain": self._gain}
 
-        def function(x: Any, ahead: Any, y: Any = None, u: Any = None, before: Any = None, p: Any = None) -> Any:
+        def function(
+            x: Any, ahead: Any, y: Any = None, u: Any = None, before: Any = None, gain: Any = fixed, p: Any = None
+        ) -> Any:
             moved = self._moved(x, u, p)
             if y is not None:
-                moved = moved + self._observed(x, y, u if before is None else before, p)
+                moved = moved + self._observed(gain, x, y, u if before is None else before, p)
             return ahead - moved
 
         residual, on, read = self._model_term(function, {"x": self.x[:-1], "ahead": self.x[1:]}, data, measured)
@@ -343,6 +360,31 @@ class Window:
             return
         self.bounds = (*self.bounds, name)
         residual, on, data = self._bounded(name, polyhedron)
+        self._inequality(name, residual, on, data, polyhedron, self._filled if name == "state" else self._filled[1:])
+
+    def _bound_residuals(self, name: str, polyhedron: Polyhedron) -> None:
+        """Bounds of a sensor's residuals; a slot in which it is missing switches its rows off."""
+        model = self.model.with_sensors([s for s in self.model.sensors if s.name == name])
+        rows = range(self.model.measurement_size)[self.model.rows(name)]
+        if polyhedron.size != len(rows):
+            raise ShapeError(
+                f"residual bounds of sensor {name!r}: expected a polyhedron on {len(rows)} component(s), got "
+                f"{polyhedron!r}"
+            )
+        if not polyhedron.matrix.shape[0]:
+            return
+        self.bounds = (*self.bounds, f"residual {name}")
+        residual, on, data = self._model_term(
+            lambda x, y, u=None, p=None: _rows_of(polyhedron, model.residual(y, _predicted(model, x, u, p))),
+            {"x": self.x},
+            {"u": self._u} if self._u is not None and model.feedthrough else {},
+            self._measured(rows, slice(None)),
+        )
+        self._inequality(f"residual {name}", residual, on, data, polyhedron, None)
+
+    def _inequality(
+        self, name: str, residual: Callable[..., Any], on: Any, data: Any, polyhedron: Polyhedron, active: Any
+    ) -> None:
         self.problem.inequality(
             f"{name} bounds",
             residual,
@@ -350,7 +392,7 @@ class Window:
             data=data,
             lower=polyhedron.lower,
             upper=polyhedron.upper,
-            active=self._filled if name == "state" else self._filled[1:],
+            active=active,
             soft=None if self.penalty is None else Soft(self.penalty, SLACK_CURVATURE),
         )
 
@@ -358,10 +400,9 @@ class Window:
         self, name: str, polyhedron: Polyhedron
     ) -> tuple[Callable[..., Any], tuple[Any, ...], tuple[Any, ...]]:
         """Rows of a bound: residual, slots and data."""
-        chosen = None if polyhedron.components is None else polyhedron.components.tolist()
 
         def rows(v: Any) -> Any:
-            return ca.DM(polyhedron.matrix) @ v if chosen is None else v[chosen]
+            return _rows_of(polyhedron, v)
 
         if name == "state" or self.w is not None:
             return self._term(rows, {"v": self.x if name == "state" else self.w}, {})
@@ -372,6 +413,12 @@ class Window:
             {"x": self.x[:-1], "ahead": self.x[1:]},
             {"u": self._u[1:]} if self._u is not None else {},
         )
+
+
+def _rows_of(polyhedron: Polyhedron, point: Any) -> Any:
+    """Rows of a polyhedron at a CasADi column."""
+    chosen = polyhedron.components
+    return ca.DM(polyhedron.matrix) @ point if chosen is None else point[chosen.tolist()]
 
 
 def _predicted(model: Model, x: Any, u: Any, p: Any) -> Any:

@@ -1,6 +1,8 @@
 """Moving horizon estimation with measurements relayed over l hops and fused arrival costs (dmhe-l-step)."""
 
 from mhe.relay.design import RelayDesign
+from mhe.relay.network import RelayEstimator
+from mhe.relay.node import RelayEstimate, RelayNode
 from mhe.relay.options import RELAY_METHODS, RelayOptions, relay_options_of
 from mhe.relay.report import RelayReport
 from mhe.relay.rule import held, reach
@@ -9,6 +11,9 @@ from mhe.relay.schedule import RelaySchedule
 __all__ = [
     "RELAY_METHODS",
     "RelayDesign",
+    "RelayEstimate",
+    "RelayEstimator",
+    "RelayNode",
     "RelayOptions",
     "RelayReport",
     "RelaySchedule",
