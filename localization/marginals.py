@@ -1,0 +1,189 @@
+"""Marginal covariances of poses in the world frame: of every pose by itself, and of several together.
+
+Those of every pose need few entries of the inverse of a sparse information matrix: Takahashi's recursion computes them
+from the factors ``L D L'`` alone, supernode by supernode from the last to the first, without any column of the inverse
+as a whole (Takahashi, Fagan and Chin 1973; Kaess and Dellaert 2009 for marginals of pose graphs).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from problems.errors import FormError, UnobservableError
+from problems.forms.least_squares import Constraints, LeastSquares
+from problems.forms.pins import Pins
+from problems.forms.sparsity import HessianPattern
+from problems.problem import Slot, Variable
+from problems.solvers.session import Session, Solution
+from problems.spaces import SE2, Vector
+from problems.spatial import SE3, rotate_array
+
+
+def joint_covariance(solution: Solution, *slots: Variable | Slot) -> np.ndarray:
+    """Covariance (k, k) of several poses and points together, in the world frame.
+
+    Coordinates stand slot after slot, instance after instance; those of a pose are its position (m) and its rotation
+    about the axes of the world (rad), so that blocks off the diagonal tell how the errors of two poses go together.
+
+    Raises:
+        UnobservableError: the costs leave a direction free.
+    """
+    joint = solution.covariance(*slots)
+    turn = np.zeros_like(joint)
+    at = 0
+    for slot in slots:
+        source = slot if isinstance(slot, Variable) else slot.source
+        values = solution[source.name]
+        for block in _frames(source.space, values if isinstance(slot, Variable) else values[slot.indices]):
+            turn[at : at + len(block), at : at + len(block)] = block
+            at += len(block)
+    return turn @ joint @ turn.T
+
+
+def marginal_covariances(session: Session, solution: Solution) -> dict[str, np.ndarray]:
+    """Covariance (count, dim, dim) of every instance of every variable by name, in the world frame.
+
+    Inequalities do not count, as in `Solution.covariance`.
+
+    Args:
+        session: that made `solution`, with the data of that solve.
+        solution: where costs are linearized; robust losses count with the weights they give there.
+
+    Raises:
+        FormError: the problem has equalities beyond instances that are held; use `joint_covariance`.
+        UnobservableError: the costs leave a direction free.
+    """
+    layout = session.layout
+    pins = Pins(layout)
+    if Constraints(layout, pins.names).equalities:
+        raise FormError(f"marginals of {session.problem.name!r}: it has equalities; use joint_covariance")
+    form = LeastSquares(session.problem, layout, whole=False)
+    _, gradient, hessian = form.bind(session.store).linearize(solution.point)
+    pattern = form.pattern
+    pins.reduce(gradient, hessian, pattern)
+    columns = {name: layout.columns(variable[:]) for name, variable in session.problem.unknowns.items()}
+    blocks = _Blocks.of(pattern, hessian, list(columns.values()))
+    held = np.zeros(pattern.size, bool)
+    held[pins.columns] = True
+    out = {}
+    for name, variable in session.problem.unknowns.items():
+        found, fixed = blocks.inverse(columns[name]), held[columns[name]]
+        found[fixed[:, :, None] | fixed[:, None, :]] = 0.0
+        turn = _frames(variable.space, solution[name])
+        out[name] = turn @ found @ turn.swapaxes(1, 2)
+    return out
+
+
+def _frames(space: Any, values: np.ndarray) -> np.ndarray:
+    """Tangent coordinates of the body in the world (count, dim, dim)."""
+    turn = np.tile(np.eye(space.dim), (len(values), 1, 1))
+    if space == SE2:
+        c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
+        turn[:, :2, :2] = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=1)
+    elif space == SE3:
+        axes = [rotate_array(values[:, 3:], np.tile(axis, (len(values), 1))) for axis in np.eye(3)]
+        turn[:, :3, :3] = turn[:, 3:, 3:] = np.stack(axes, axis=2)
+    elif not isinstance(space, Vector):
+        raise FormError(f"no world frame for the tangent of {space!r}")
+    return turn
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Entries of an inverse on the pattern of the factors: for each supernode, the square of all it touches.
+
+    Attributes:
+        place: (n,) position of each unknown in the order of elimination.
+        node: (n,) supernode of each position.
+        rows: per supernode, the positions it touches, ascending; its own are first.
+        squares: per supernode, entries of the inverse on its rows and columns `rows`.
+    """
+
+    place: np.ndarray
+    node: np.ndarray
+    rows: list[np.ndarray]
+    squares: list[np.ndarray]
+
+    @classmethod
+    def of(cls, pattern: HessianPattern, upper: np.ndarray, instances: list[np.ndarray]) -> _Blocks:
+        """From the upper triangle of a matrix; raises UnobservableError where it is not positive definite."""
+        import qdldl
+        from scipy.sparse import coo_matrix, csc_matrix
+
+        size = pattern.size
+        column = np.repeat(np.arange(size), np.diff(pattern.indptr))
+        one = np.concatenate([np.repeat(block, block.shape[1], axis=1).ravel() for block in instances])
+        other = np.concatenate([np.tile(block, block.shape[1]).ravel() for block in instances])
+        kept = one > other
+        # entries that are zero still belong to the pattern of the factors, which drop those that are exactly zero
+        entries = np.concatenate([upper, np.zeros(int(kept.sum()))]) + 1e-300
+        ends = (np.concatenate([pattern.indices, other[kept]]), np.concatenate([column, one[kept]]))
+        matrix = csc_matrix(coo_matrix((entries, ends), shape=(size, size)))
+        try:
+            L, D, order = qdldl.Solver(matrix, upper=True).factors()
+        except RuntimeError as error:
+            raise UnobservableError(f"no covariance: the costs leave a direction free ({error})") from error
+        if not (D > 0).all():
+            raise UnobservableError("no covariance: the costs leave a direction free; add a prior or fix the gauge")
+        L = csc_matrix(L)
+        L.sort_indices()
+        place = np.empty(size, np.intp)
+        place[order] = np.arange(size)
+        starts = _supernodes(L)
+        node = np.searchsorted(starts, np.arange(size), side="right") - 1
+        rows, squares = _takahashi(L, D, starts, node)
+        return cls(place, node, rows, squares)
+
+    def inverse(self, columns: np.ndarray) -> np.ndarray:
+        """Blocks (count, d, d) of the inverse on `columns` (count, d), each of which the factors hold together."""
+        out = np.empty((*columns.shape, columns.shape[1]))
+        for k, at in enumerate(self.place[columns]):
+            node = self.node[at.min()]
+            inside = np.searchsorted(self.rows[node], at)
+            out[k] = self.squares[node][np.ix_(inside, inside)]
+        return out
+
+
+def _supernodes(L: Any) -> np.ndarray:
+    """First columns of runs whose patterns are one dense triangle above common rows."""
+    size, count = L.shape[0], np.diff(L.indptr)
+    first = np.full(size, -1)
+    first[count > 0] = L.indices[L.indptr[:-1][count > 0]]
+    follows = (first[:-1] == np.arange(1, size)) & (count[:-1] == count[1:] + 1)
+    return np.flatnonzero(np.r_[True, ~follows])
+
+
+def _takahashi(
+    L: Any, D: np.ndarray, starts: np.ndarray, node: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    from scipy.linalg import solve_triangular
+
+    ends = np.r_[starts[1:], L.shape[0]]
+    rows: list[Any] = [None] * len(starts)
+    squares: list[Any] = [None] * len(starts)
+    for k in range(len(starts) - 1, -1, -1):
+        first, last = starts[k], ends[k]
+        width = last - first
+        below = L.indices[L.indptr[last - 1] : L.indptr[last]]
+        count = width + below.size
+        columns = np.zeros((count, width))
+        for j in range(width):
+            columns[j + 1 :, j] = L.data[L.indptr[first + j] : L.indptr[first + j + 1]]
+        columns[np.arange(width), np.arange(width)] = 1.0
+        corner = solve_triangular(columns[:width], np.eye(width), lower=True, unit_diagonal=True)
+        square = np.empty((count, count))
+        square[:width, :width] = (corner.T / D[first:last]) @ corner
+        if below.size:
+            above = node[below[0]]  # what a supernode touches, the next one it touches does as well
+            inside = np.searchsorted(rows[above], below)
+            known = squares[above][np.ix_(inside, inside)]
+            ratio = columns[width:] @ corner
+            off = -known @ ratio
+            square[width:, width:] = known
+            square[width:, :width], square[:width, width:] = off, off.T
+            square[:width, :width] -= ratio.T @ off
+        rows[k], squares[k] = np.r_[np.arange(first, last), below], square
+    return rows, squares
