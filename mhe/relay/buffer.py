@@ -78,7 +78,7 @@ class RelayBuffer:
     def outgoing(self) -> dict[str, Any]:
         """Fields of the message for what is sent on in this step, see `RELAYED`; own measurements travel as such."""
         first = self._now - self.newest
-        if self._options.relay == "incremental":
+        if self._options.relay == "incremental" or self._options.steps == 1:  # the measurement itself is the one hop
             entries = [(k, source) for k, source in self._sent_next if k >= first]
         else:
             slots, places = np.nonzero(self._hops[: self.newest] >= 0)

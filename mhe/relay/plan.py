@@ -116,8 +116,6 @@ def plan_of(design: RelayDesign, node: int) -> RelayPlan:
         fused=fused,
         options=options,
         state_bounds=design.state_bounds,
-        residual_bounds={
-            s.name: design.residual_bounds[s.name] for s in model.sensors if s.name in design.residual_bounds
-        },
+        residual_bounds={name: design.residual_bounds[name] for name in names if name in design.residual_bounds},
         period=design.model.dt or 1.0,
     )
