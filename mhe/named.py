@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mhe.distributed import DistributedEstimator
+from mhe.relay import RelayEstimator
 from problems.models import Model
 from problems.networks import Network
 
@@ -26,3 +27,26 @@ def dmhe_pre(model: Model, network: Network, **options: Any) -> DistributedEstim
 def dmhe_w_pre(model: Model, network: Network, **options: Any) -> DistributedEstimator:
     """DMHE with pre-estimation and observability rank weights (`DMHE_w-pre`); arguments as for `dmhe_f`."""
     return DistributedEstimator(model, network, "dmhe_w_pre", **options)
+
+
+def dmhe_l_pre(model: Model, network: Network, **options: Any) -> RelayEstimator:
+    """Pre-estimation with measurements relayed over `l` hops (N by default) and fused arrival costs (`DMHE_pre^l`).
+
+    Args:
+        model, network, options: as for `RelayEstimator`, which also says what is raised.
+    """
+    return RelayEstimator(model, network, "dmhe_l_pre", **options)
+
+
+def dmhe_1_pre(model: Model, network: Network, **options: Any) -> RelayEstimator:
+    """`dmhe_l_pre` with the measurements of direct neighbours only (`DMHE_pre^1`); arguments as there."""
+    return RelayEstimator(model, network, "dmhe_1_pre", **options)
+
+
+def dmhe_b(model: Model, network: Network, **options: Any) -> RelayEstimator:
+    """Estimated disturbances, data of direct neighbours and fused arrival costs (`DMHE_B`, Battistelli 2018).
+
+    Args:
+        model, network, options: as for `RelayEstimator`, which also says what is raised.
+    """
+    return RelayEstimator(model, network, "dmhe_b", **options)
