@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import io
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from problems.errors import FormError
+from problems.forms.stages import find_stages
 from problems.solvers.base import Options, QPResult, Status
 from problems.solvers.qp_support import Backend, Warm, checked_settings, native
 
@@ -24,12 +26,15 @@ class _Conic(Backend):
     package: ClassVar[str] = "casadi"
     module: ClassVar[str] = "casadi"
 
+    @abstractmethod
     def _plugin_options(self) -> dict[str, Any]:
-        raise NotImplementedError
+        """Options of the plugin, translated from ours."""
 
     def _build(self, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> None:
-        lib, n, m = self._library, self._n, self._m
-        P, A = self._P, self._A
+        self._make(self._P, self._A)
+
+    def _make(self, P: Any, A: Any) -> None:
+        lib, (m, n) = self._library, A.shape
         structure = {"h": _sparsity(lib, P), "a": _sparsity(lib, A)}
         # Some plugins announce themselves on standard output.
         with contextlib.redirect_stdout(io.StringIO()):
@@ -179,9 +184,9 @@ class QRQP(_Conic):
 class HPIPMSettings:
     """Settings of `HPIPM`; None keeps the library's default or what follows from `Options`.
 
-    Without N, nx, nu and ng there is one stage. Else the unknowns are ordered ``x_0, u_0, x_1, u_1, ..., x_N``, the
-    rows ``dynamics_0, others_0, dynamics_1, ...`` with dynamics ``A_k x_k + B_k u_k - x_{k+1} = b_k``; P joins only
-    unknowns of the same stage.
+    Without N, nx, nu and ng they are found (`problems.forms.stages`), a program without a chain is one stage. With
+    them the unknowns are ordered ``x_0, u_0, x_1, u_1, ..., x_N``, the rows ``dynamics_0, others_0, dynamics_1, ...``
+    with dynamics ``A_k x_k + B_k u_k - x_{k+1} = b_k``; P joins only unknowns of the same stage.
 
     Attributes:
         N: number of stages after the first.
@@ -219,7 +224,10 @@ class HPIPMSettings:
 
 
 class HPIPM(_Conic):
-    """QP backend ``hpipm``: any quadratic program as one dense stage, or in the stages that its settings state.
+    """QP backend ``hpipm``: interior point in stages, found in the program or stated by the settings.
+
+    Attributes:
+        stages: N, nx, nu and ng in use, once the library's object is built.
 
     Raises:
         FormError: the stages are given in part, or P and A do not have the structure they say.
@@ -228,44 +236,97 @@ class HPIPM(_Conic):
     name: ClassVar[str] = "hpipm"
     warm_starts: ClassVar[bool] = False
     settings_type: ClassVar[type[HPIPMSettings]] = HPIPMSettings
+    stages: dict[str, Any]
 
     def __init__(self, P: Any, q: np.ndarray, A: Any, l: np.ndarray, u: np.ndarray, options: Options) -> None:
         settings = checked_settings(HPIPMSettings, options.extra, self.name)
-        stages = {name: getattr(settings, name) for name in ("N", "nx", "nu", "ng")}
-        missing = [name for name, value in stages.items() if value is None]
-        if len(missing) == len(stages):
-            one = {"N": 0, "nx": (P.shape[0],), "nu": (0,), "ng": (A.shape[0],)}
-            options = replace(options, extra={**options.extra, **one})
-        elif missing:
+        self._stated = {name: getattr(settings, name) for name in ("N", "nx", "nu", "ng")}
+        missing = [name for name, value in self._stated.items() if value is None]
+        if 0 < len(missing) < len(self._stated):
             raise FormError(
                 "solver hpipm: stages are stated by the settings N, nx, nu and ng together, and "
-                f"{', '.join(missing)} is missing; without any of them the program is one stage"
+                f"{', '.join(missing)} is missing; without any of them the stages are found"
             )
         super().__init__(P, q, A, l, u, options)
 
     def _plugin_options(self) -> dict[str, Any]:
         common = self._options
         half = 0.5 * common.tolerance
-        # An infinite bound takes part as this number, whose rounding the residual of bounds cannot get below.
-        infinity = self._settings.inf or 1e8
         inner = native(
             self._settings,
             res_g_max=half,
             res_b_max=half,
-            res_d_max=max(half, 4.0 * np.finfo(float).eps * infinity),
+            # the rounding of what stands for an infinite bound is what the residual of bounds cannot get below
+            res_d_max=max(half, 4.0 * np.finfo(float).eps * self._infinity),
             res_m_max=half,
             lam_min=1e-25,
             iter_max=common.iteration_limit,
         )
-        outer = {name: inner.pop(name) for name in ("N", "nx", "nu", "ng", "inf") if name in inner}
-        return {**outer, "hpipm": inner}
+        for name in ("N", "nx", "nu", "ng", "inf"):
+            inner.pop(name, None)
+        return {**self.stages, "inf": self._infinity, "hpipm": inner}
+
+    @property
+    def _infinity(self) -> float:
+        return self._settings.inf or 1e8
 
     def _build(self, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> None:
+        n, m = self._n, self._m
+        self._unknowns, self._order = np.arange(n), np.arange(m)
+        self._dynamics = np.empty(0, np.intp)
+        if self._stated["N"] is not None:
+            self.stages = self._stated
+        else:
+            self.stages = {"N": 0, "nx": (n,), "nu": (0,), "ng": (m,)}
+            found = find_stages(self._P, self._A, l == u)
+            if found is not None:
+                sizes = {"nx": found.states, "nu": found.controls, "ng": found.others}
+                self.stages = {"N": found.states.size - 1} | {k: tuple(v.tolist()) for k, v in sizes.items()}
+                self._unknowns, self._order = found.unknowns, found.rows
+                self._dynamics = np.flatnonzero(found.defining[found.rows] >= 0)
+                self._defined = found.defining[self._order[self._dynamics]]
+        self._taken_P = _Entries(self._P, self._unknowns, self._unknowns)
+        self._taken_A = _Entries(self._A, self._order, self._unknowns)
+        self._scale = np.ones(m)
+        P, A = self._staged()
         try:
-            super()._build(q, l, u)
+            self._make(P, A)
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
             raise FormError(f"solver hpipm: P and A do not have the stages N, nx, nu, ng say: {reason}") from error
+
+    def _staged(self) -> tuple[Any, Any]:
+        """P and A in the order of the stages, dynamics scaled so that the state they define has the factor -1."""
+        P, A = self._taken_P(self._P), self._taken_A(self._A)
+        if self._dynamics.size:
+            factors = self._A[self._order[self._dynamics], self._defined]
+            self._scale[self._dynamics] = -1.0 / np.asarray(factors).ravel()
+            A.data *= self._scale[A.indices]
+        return P, A
+
+    def _renew(self) -> None:
+        if not (self._taken_P.hold(self._P) and self._taken_A.hold(self._A)):
+            self._stale = True
+            return
+        P, A = self._staged()
+        self._h[:] = P.data
+        self._a[:] = A.data
+        self._stale = not np.isfinite(self._scale).all()
+
+    def _run(self, q: np.ndarray, l: np.ndarray, u: np.ndarray, warm: Warm | None) -> QPResult:
+        rows, scale, limit = self._order, self._scale, self._infinity
+        dynamics = rows[self._dynamics]
+        if (l[dynamics] != u[dynamics]).any():  # an equality no more
+            self._build(q, l, u)
+            return self._run(q, l, u, warm)
+        lower, upper = np.clip(l[rows], -limit, limit) * scale, np.clip(u[rows], -limit, limit) * scale
+        result = super()._run(q[self._unknowns], lower, upper, warm)
+        if result.x is None or result.y is None:
+            return result
+        x, y = np.empty(self._n), np.empty(self._m)
+        x[self._unknowns] = result.x
+        y[rows] = result.y * scale
+        return replace(result, x=x, y=y)
 
     def _failed(self, x: np.ndarray, y: np.ndarray, iterations: int, message: str, unified: str) -> QPResult:
         # The method stops at its limit with a point that is often good: the residuals tell.
@@ -277,3 +338,26 @@ class HPIPM(_Conic):
 
 def _sparsity(library: Any, matrix: Any) -> Any:
     return library.Sparsity(*matrix.shape, matrix.indptr.tolist(), matrix.indices.tolist())
+
+
+class _Entries:
+    """Entries of a sparse matrix that are not zero, its rows and columns in another order; refilled by copying."""
+
+    def __init__(self, matrix: Any, rows: np.ndarray, columns: np.ndarray) -> None:
+        self._zero = np.flatnonzero(matrix.data == 0)
+        numbered = matrix.copy()
+        numbered.data[:] = np.arange(1.0, matrix.nnz + 1)
+        numbered.data[self._zero] = 0.0
+        numbered.eliminate_zeros()
+        ordered = numbered.tocsr()[rows].tocsc()[:, columns]
+        ordered.sort_indices()
+        self._source = ordered.data.astype(np.intp) - 1
+        self._matrix = ordered
+
+    def hold(self, matrix: Any) -> bool:
+        """Whether a matrix of the same pattern has no further entries."""
+        return not matrix.data[self._zero].any()
+
+    def __call__(self, matrix: Any) -> Any:
+        self._matrix.data[:] = matrix.data[self._source]
+        return self._matrix

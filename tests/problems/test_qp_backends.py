@@ -843,14 +843,51 @@ def test_hpipm_on_stages(tolerance: float) -> None:
         np.testing.assert_allclose(result.x, reference.x, atol=30 * tolerance**0.75)
 
 
-def test_hpipm_without_stages_takes_any_program_as_one() -> None:
+def test_hpipm_finds_the_stages() -> None:
+    """In any order of unknowns and rows, with zeros stored; new numbers and new kinds of rows included."""
     from problems.solvers.qp_casadi import HPIPM
 
-    for qp in (staged_qp(np.random.default_rng(18))[0], random_qp(np.random.default_rng(2), 8, 12, 3)):
-        status, result = qp.judged(qp.backend(HPIPM))
-        assert status is Status.SOLVED, result.message
-        reference = qp.judged(qp.backend(backend_class("daqp")))[1]
-        np.testing.assert_allclose(result.x, reference.x, atol=1e-5)
+    rng = np.random.default_rng(18)
+    qp = staged_qp(rng)[0]
+    columns, order = rng.permutation(len(qp.q)), rng.permutation(len(qp.l))
+    A = (rng.choice([-2.0, 0.5, 1.0], len(qp.l))[:, None] * qp.A)[np.ix_(order, columns)]
+    bound = np.sort(np.stack([-np.abs(qp.l), np.abs(qp.u)]), axis=0)[:, order]
+    equal = (qp.l == qp.u)[order]
+    l, u = np.where(equal, qp.l[order], bound[0]), np.where(equal, qp.l[order], bound[1])
+    mixed = QP(qp.P[np.ix_(columns, columns)], qp.q[columns], A, l, u)
+    joined = mixed.P.copy()  # the ends of the chain by a cost: no chain any more
+    joined[columns.argsort()[[0, -1]], columns.argsort()[[-1, 0]]] += 0.01
+    loose = mixed.u + np.where(equal, 0.1, 0.0)  # no row is an equality any more
+    rescaled = QP(1.5 * mixed.P, mixed.q, 0.5 * A, l, u)
+    for others, stages in (
+        ((mixed, rescaled, mixed), (4, 4, 4)),
+        (
+            (rescaled, QP(joined, mixed.q, A, l, u), mixed),
+            (4, 0, 0),
+        ),  # entries that are zero now are no reason to search
+        ((mixed, QP(mixed.P, mixed.q, A, l, loose), mixed), (4, 0, 0)),
+    ):
+        backend = mixed.backend(HPIPM)
+        for problem, expected in zip(others, stages, strict=True):
+            backend.update(*problem.matrices(HPIPM))
+            status, result = problem.judged(backend)
+            assert status is Status.SOLVED, result.message
+            reference = problem.judged(problem.backend(backend_class("daqp")))[1]
+            np.testing.assert_allclose(result.x, reference.x, atol=1e-5)
+            np.testing.assert_allclose(problem.A.T @ result.y, problem.A.T @ reference.y, atol=1e-4)
+            assert backend.stages["N"] == expected
+
+
+def test_hpipm_takes_any_program_as_one_stage() -> None:
+    from problems.solvers.qp_casadi import HPIPM
+
+    qp = random_qp(np.random.default_rng(2), 8, 12, 3)
+    backend = qp.backend(HPIPM)
+    status, result = qp.judged(backend)
+    assert status is Status.SOLVED, result.message
+    assert backend.stages["N"] == 0
+    reference = qp.judged(qp.backend(backend_class("daqp")))[1]
+    np.testing.assert_allclose(result.x, reference.x, atol=1e-5)
 
 
 def test_hpipm_refuses_stages_that_are_not_there() -> None:
