@@ -22,6 +22,7 @@ from problems.networks.reports import covariance_growth
 from problems.networks.weights import Weights
 
 CovarianceUpdate = Literal["seed", "exact"]
+DetectionUpdate = Literal["literal", "exact", "onestep"]
 
 CAP_FACTOR = 1e8
 SETTLED_TOLERANCE = 1e-13
@@ -154,18 +155,18 @@ def window_information(informations: Sequence[np.ndarray] | np.ndarray, A: Array
 
     Args:
         informations: M_k (..., n, n) of every instant, oldest first; see `output_information`.
-        A: (n, n).
-        Q: (n, n), may be singular.
+        A: (n, n), or with the leading axes of M_k.
+        Q: the same, may be singular.
 
     Returns:
         (..., n, n).
     """
     state, disturbance = np.asarray(A, dtype=float), np.asarray(Q, dtype=float)
     known = np.asarray(informations[-1], dtype=float)
-    identity = np.eye(len(state))
+    identity, transposed = np.eye(state.shape[-1]), np.swapaxes(state, -1, -2)
     for instant in range(len(informations) - 2, -1, -1):
         forgotten = np.linalg.solve(identity + known @ disturbance, known)
-        known = symmetrized(informations[instant] + state.T @ forgotten @ state)
+        known = symmetrized(informations[instant] + transposed @ forgotten @ state)
     return known
 
 
@@ -183,8 +184,7 @@ def arrival_update(
 
     Args:
         fused: Pi_bar (..., n, n) at t-N-1, positive definite.
-        A: (n, n).
-        Q: (n, n).
+        A, Q: (n, n), or with the leading axes of Pi_bar.
         information: C' R^-1 C (..., n, n) of instant t-N-1.
         window: information of the N measurements, `window_information`: of instants t-N-1..t-2 for ``seed``, of
             t-N..t-1 for ``exact`` (the same where the outputs are constant).
@@ -199,10 +199,59 @@ def arrival_update(
         UnknownNameError: an unknown rule.
     """
     if rule == "seed":
-        return symmetrized(A @ conditioned(fused, information + window) @ A.T + Q)
+        return symmetrized(A @ conditioned(fused, information + window) @ np.swapaxes(A, -1, -2) + Q)
     if rule == "exact":
-        return conditioned(symmetrized(A @ conditioned(fused, information) @ A.T + Q), window)
+        return conditioned(predicted(fused, A, Q, information), window)
     raise UnknownNameError("covariance update", rule, get_args(CovarianceUpdate))
+
+
+def predicted(fused: np.ndarray, A: np.ndarray, Q: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Covariance of the next state after a measurement, ``Q + A (Pi^-1 + M)^-1 A'`` (``onestep`` in the spec below).
+
+    Source: dmhe-sporadic-fov 3.8.
+
+    Args:
+        fused: Pi (..., n, n), positive definite.
+        A, Q: (n, n), or with the leading axes of Pi.
+        information: M = C' R^-1 C (..., n, n).
+
+    Returns:
+        (..., n, n).
+
+    Raises:
+        NoiseError: a covariance is not positive definite.
+    """
+    return symmetrized(A @ conditioned(fused, information) @ np.swapaxes(A, -1, -2) + Q)
+
+
+def detection_update(
+    fused: np.ndarray, A: np.ndarray, Q: np.ndarray, informations: np.ndarray, rule: DetectionUpdate = "literal"
+) -> np.ndarray:
+    """Covariance Pi of x_{t-N} from the fused one of x_{t-N-1}, with what was detected at each instant.
+
+    Source: dmhe-sporadic-fov 3.8.
+
+    Args:
+        fused: Pi_bar (..., n, n) at t-N-1, positive definite.
+        A, Q: (n, n), or with the leading axes of Pi_bar.
+        informations: M_k (N + 1, ..., n, n) of instants t-N-1..t-1.
+        rule: ``literal``, the printed (2.29)-(2.30), which uses instant t-N-1 twice; ``exact``, given the readings
+            t-N-1..t-1; ``onestep``, given the reading of t-N-1 alone (the filter's covariance).
+
+    Returns:
+        (..., n, n).
+
+    Raises:
+        NoiseError: a covariance is not positive definite.
+        UnknownNameError: an unknown rule.
+    """
+    if rule == "onestep":
+        return predicted(fused, A, Q, informations[0])
+    if rule not in get_args(DetectionUpdate):
+        raise UnknownNameError("covariance update", rule, get_args(DetectionUpdate))
+    literal = rule == "literal"
+    window = window_information(informations[:-1] if literal else informations[1:], A, Q)
+    return arrival_update(fused, A, Q, informations[0], window, "seed" if literal else "exact")
 
 
 def centralized_covariances(

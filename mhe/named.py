@@ -6,17 +6,33 @@ from typing import Any
 
 from mhe.distributed import DistributedEstimator
 from mhe.relay import RelayEstimator
+from mhe.sporadic import SporadicEstimator
 from problems.models import Model
 from problems.networks import Network
 
 
-def dmhe_f(model: Model, network: Network, **options: Any) -> DistributedEstimator:
+def dmhe_f(
+    model: Model, network: Network, *, detections: bool = False, **options: Any
+) -> DistributedEstimator | SporadicEstimator:
     """DMHE with estimated disturbances and uniform weights (`DMHE`, `DMHE_F` of the sources).
 
     Args:
-        model, network, options: as for `DistributedEstimator`, which also says what is raised.
+        model, network, options: as for `DistributedEstimator`, which also says what is raised; with `detections` as for
+            `SporadicEstimator`.
+        detections: readings come with detection flags, and covariances follow them.
     """
+    if detections:
+        return SporadicEstimator(model, network, "dmhe_f", **options)
     return DistributedEstimator(model, network, "dmhe_f", **options)
+
+
+def dmhe_f_s(model: Model, network: Network, **options: Any) -> SporadicEstimator:
+    """`dmhe_f` with detections and field-of-view rows (`DMHE_F^S`).
+
+    Args:
+        model, network, options: as for `SporadicEstimator`, which also says what is raised.
+    """
+    return SporadicEstimator(model, network, "dmhe_f_s", **options)
 
 
 def dmhe_pre(model: Model, network: Network, **options: Any) -> DistributedEstimator:
@@ -24,9 +40,21 @@ def dmhe_pre(model: Model, network: Network, **options: Any) -> DistributedEstim
     return DistributedEstimator(model, network, "dmhe_pre", **options)
 
 
-def dmhe_w_pre(model: Model, network: Network, **options: Any) -> DistributedEstimator:
-    """DMHE with pre-estimation and observability rank weights (`DMHE_w-pre`); arguments as for `dmhe_f`."""
+def dmhe_w_pre(
+    model: Model, network: Network, *, detections: bool = False, **options: Any
+) -> DistributedEstimator | SporadicEstimator:
+    """DMHE with pre-estimation and observability rank weights (`DMHE_w-pre`; with detections `DMHE` of chapter 4).
+
+    Arguments as for `dmhe_f`.
+    """
+    if detections:
+        return SporadicEstimator(model, network, "dmhe_w_pre", **options)
     return DistributedEstimator(model, network, "dmhe_w_pre", **options)
+
+
+def dmhe_w_pre_s(model: Model, network: Network, **options: Any) -> SporadicEstimator:
+    """`dmhe_w_pre` with detections and field-of-view rows (`DMHE^S`); arguments as for `dmhe_f_s`."""
+    return SporadicEstimator(model, network, "dmhe_w_pre_s", **options)
 
 
 def dmhe_l_pre(model: Model, network: Network, **options: Any) -> RelayEstimator:

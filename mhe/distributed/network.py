@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -62,11 +62,12 @@ class NetworkEstimate:
     time: float
 
 
-class DistributedEstimator:
-    """A network of `DistributedNode` over a simulated transport.
+class NetworkRun:
+    """Nodes of a network run step by step over a simulated transport; base of the distributed estimators.
 
     Args:
-        model, network, method, design: see `NetworkDesign`, also for the errors and warnings.
+        model, network: of the nodes.
+        factory: makes a node from its index.
         links: loss and delay; ideal by default.
         outages: when nodes are down, in time steps.
         rng: seeds loss and delay.
@@ -74,8 +75,6 @@ class DistributedEstimator:
         record: keep a `Trace`.
 
     Attributes:
-        design: what was settled before the run.
-        options: of the method.
         status: steps by status, over all nodes.
     """
 
@@ -83,17 +82,16 @@ class DistributedEstimator:
         self,
         model: Model,
         network: Network,
-        method: str | DistributedOptions = "dmhe_f",
+        factory: Callable[[int], Any],
         *,
         links: Links | None = None,
         outages: Iterable[Outage] = (),
         rng: np.random.Generator | None = None,
         processes: bool = False,
         record: bool = False,
-        **design: Any,
     ) -> None:
-        self.design = NetworkDesign(model, network, method, **design)
-        self.model, self.network, self.options = self.design.model, network, self.design.options
+        self.model, self.network = model, network
+        self._factory = factory
         self._transport = {
             "links": links,
             "outages": tuple(outages),
@@ -107,30 +105,17 @@ class DistributedEstimator:
         """Forget everything but the design: the next step is the first one. Loss and delay are drawn anew."""
         if "_simulation" in self.__dict__:
             self.close()
-        factory = NodeFactory(self.design.plans, self.design.pool)
-        self._simulation = Simulation(self.network, factory, rng=self._rng, **self._transport)
+        self._simulation = Simulation(self.network, self._factory, rng=self._rng, **self._transport)
         self._last: float | None = None
         self.status: Counter[Status] = Counter()
 
-    def step(self, measurements: Any, inputs: Any = None, time: float | None = None) -> NetworkEstimate:
-        """Take the measurements of the next instant. The first step is instant 0: it reports mu_0 and solves nothing.
-
-        Args:
-            measurements: one entry (p_i,) or None per node, a matrix (count, p), or the collective vector (p,).
-            inputs: u_{t-1} (m,), which acted since the previous instant, known to all nodes.
-            time: of the step (s), a label; the model's sampling time is counted on from the last one if None.
-
-        Raises:
-            ShapeError, DataError: measurements or inputs that do not fit; a time that does not advance.
-        """
+    def _run(self, entries: list[Any], time: float | None) -> NetworkEstimate:
+        """One step of all nodes with one measurement each."""
         period = self.model.dt or 1.0
         if time is None:
             time = 0.0 if self._last is None else self._last + period
         elif self._last is not None and not time > self._last:
             raise DataError(f"time: expected a number later than the last step's {self._last}, got {time!r}")
-        entries = self.design.by_node(measurements)
-        if self.model.input_size:
-            entries = [(entry, inputs) for entry in entries]
         instant = self._simulation.steps
         nodes: list[Estimate | None] = self._simulation.step(entries, instant * period)
         self._last = float(time)
@@ -175,3 +160,59 @@ class DistributedEstimator:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class DistributedEstimator(NetworkRun):
+    """A network of `DistributedNode` over a simulated transport.
+
+    Args:
+        model, network, method, design: see `NetworkDesign`, also for the errors and warnings.
+        links, outages, rng, processes, record: see `NetworkRun`.
+
+    Attributes:
+        design: what was settled before the run.
+        options: of the method.
+        status: steps by status, over all nodes.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        network: Network,
+        method: str | DistributedOptions = "dmhe_f",
+        *,
+        links: Links | None = None,
+        outages: Iterable[Outage] = (),
+        rng: np.random.Generator | None = None,
+        processes: bool = False,
+        record: bool = False,
+        **design: Any,
+    ) -> None:
+        self.design = NetworkDesign(model, network, method, **design)
+        self.options = self.design.options
+        super().__init__(
+            self.design.model,
+            network,
+            NodeFactory(self.design.plans, self.design.pool),
+            links=links,
+            outages=outages,
+            rng=rng,
+            processes=processes,
+            record=record,
+        )
+
+    def step(self, measurements: Any, inputs: Any = None, time: float | None = None) -> NetworkEstimate:
+        """Take the measurements of the next instant. The first step is instant 0: it reports mu_0 and solves nothing.
+
+        Args:
+            measurements: one entry (p_i,) or None per node, a matrix (count, p), or the collective vector (p,).
+            inputs: u_{t-1} (m,), which acted since the previous instant, known to all nodes.
+            time: of the step (s), a label; the model's sampling time is counted on from the last one if None.
+
+        Raises:
+            ShapeError, DataError: measurements or inputs that do not fit; a time that does not advance.
+        """
+        entries = self.design.by_node(measurements)
+        if self.model.input_size:
+            entries = [(entry, inputs) for entry in entries]
+        return self._run(entries, time)
