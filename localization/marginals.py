@@ -7,6 +7,7 @@ as a whole (Takahashi, Fagan and Chin 1973; Kaess and Dellaert 2009 for marginal
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,14 +44,20 @@ def joint_covariance(solution: Solution, *slots: Variable | Slot) -> np.ndarray:
     return turn @ joint @ turn.T
 
 
-def marginal_covariances(session: Session, solution: Solution) -> dict[str, np.ndarray]:
+def marginal_covariances(session: Session, solution: Solution, aligned: bool = False) -> dict[str, np.ndarray]:
     """Covariance (count, dim, dim) of every instance of every variable by name, in the world frame.
+
+    Where the gauge is fixed by holding one pose, all uncertainty counts from there and that of its heading hides
+    everything far away. `aligned` gives the covariances of the errors that remain when the trajectory is moved onto the
+    truth rigidly, as for the absolute trajectory error: with T the least-squares motion (linearized about the centre)
+    of position errors and G the motions it stands for, those of ``(I - G T) error``.
 
     Inequalities do not count, as in `Solution.covariance`.
 
     Args:
         session: that made `solution`, with the data of that solve.
         solution: where costs are linearized; robust losses count with the weights they give there.
+        aligned: see above.
 
     Raises:
         FormError: the problem has equalities beyond instances that are held; use `joint_covariance`.
@@ -68,12 +75,61 @@ def marginal_covariances(session: Session, solution: Solution) -> dict[str, np.n
     blocks = _Blocks.of(pattern, hessian, list(columns.values()))
     held = np.zeros(pattern.size, bool)
     held[pins.columns] = True
+    turns = {name: _frames(v.space, solution[name]) for name, v in session.problem.unknowns.items()}
     out = {}
-    for name, variable in session.problem.unknowns.items():
+    for name, turn in turns.items():
         found, fixed = blocks.inverse(columns[name]), held[columns[name]]
         found[fixed[:, :, None] | fixed[:, None, :]] = 0.0
-        turn = _frames(variable.space, solution[name])
         out[name] = turn @ found @ turn.swapaxes(1, 2)
+    if aligned:
+        _align(out, session, solution, columns, turns, lambda right: _columns_of_inverse(blocks, right, held))
+    return out
+
+
+def _columns_of_inverse(blocks: _Blocks, right: np.ndarray, held: np.ndarray) -> np.ndarray:
+    right = np.where(held[:, None], 0.0, right)
+    return np.column_stack([blocks.solver.solve(np.ascontiguousarray(column)) for column in right.T])
+
+
+def _align(
+    out: dict[str, np.ndarray],
+    session: Session,
+    solution: Solution,
+    columns: dict[str, np.ndarray],
+    turns: dict[str, np.ndarray],
+    solve: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    """Covariances of what a rigid alignment of all poses leaves, in place."""
+    unknowns = session.problem.unknowns
+    poses = [name for name, variable in unknowns.items() if variable.space in (SE2, SE3)]
+    d = 2 if unknowns[poses[0]].space == SE2 else 3
+    center = np.vstack([solution[name][:, :d] for name in poses]).mean(axis=0)
+    motions = {name: _motions(solution[name][:, :d] - center, v.space.dim) for name, v in unknowns.items()}
+    placed = np.vstack([motions[name][:, :d].reshape(-1, motions[name].shape[2]) for name in poses])
+    weight = np.linalg.pinv(placed.T @ placed)
+    right = np.zeros((session.layout.size, len(weight)))
+    for name in poses:
+        moved = np.zeros((*columns[name].shape, len(weight)))
+        moved[:, :d] = motions[name][:, :d] @ weight
+        right[columns[name]] = turns[name].swapaxes(1, 2) @ moved
+    spread = solve(right)
+    common = right.T @ spread
+    for name, motion in motions.items():
+        both = motion @ (turns[name] @ spread[columns[name]]).swapaxes(1, 2)
+        out[name] += motion @ common @ motion.swapaxes(1, 2) - both - both.swapaxes(1, 2)
+
+
+def _motions(away: np.ndarray, dim: int) -> np.ndarray:
+    """What rigid motions (translations, then rotations about the centre) do to poses or points, world frame."""
+    count, d = away.shape
+    turns = 1 if d == 2 else 3
+    out = np.zeros((count, dim, d + turns))
+    out[:, :d, :d] = np.eye(d)
+    if d == 2:
+        out[:, 0, 2], out[:, 1, 2] = -away[:, 1], away[:, 0]
+    else:
+        out[:, :3, 3:] = np.cross(np.eye(3)[None], away[:, None, :]).swapaxes(1, 2)
+    out[:, d:, d:] = np.eye(turns)[: dim - d]
     return out
 
 
@@ -100,12 +156,14 @@ class _Blocks:
         node: (n,) supernode of each position.
         rows: per supernode, the positions it touches, ascending; its own are first.
         squares: per supernode, entries of the inverse on its rows and columns `rows`.
+        solver: of the whole system.
     """
 
     place: np.ndarray
     node: np.ndarray
     rows: list[np.ndarray]
     squares: list[np.ndarray]
+    solver: Any
 
     @classmethod
     def of(cls, pattern: HessianPattern, upper: np.ndarray, instances: list[np.ndarray]) -> _Blocks:
@@ -123,7 +181,8 @@ class _Blocks:
         ends = (np.concatenate([pattern.indices, other[kept]]), np.concatenate([column, one[kept]]))
         matrix = csc_matrix(coo_matrix((entries, ends), shape=(size, size)))
         try:
-            L, D, order = qdldl.Solver(matrix, upper=True).factors()
+            solver = qdldl.Solver(matrix, upper=True)
+            L, D, order = solver.factors()
         except RuntimeError as error:
             raise UnobservableError(f"no covariance: the costs leave a direction free ({error})") from error
         if not (D > 0).all():
@@ -135,7 +194,7 @@ class _Blocks:
         starts = _supernodes(L)
         node = np.searchsorted(starts, np.arange(size), side="right") - 1
         rows, squares = _takahashi(L, D, starts, node)
-        return cls(place, node, rows, squares)
+        return cls(place, node, rows, squares, solver)
 
     def inverse(self, columns: np.ndarray) -> np.ndarray:
         """Blocks (count, d, d) of the inverse on `columns` (count, d), each of which the factors hold together."""

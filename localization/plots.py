@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from localization.ellipses import draw_ellipses
 from localization.io.recording import UwbRecording
 from localization.lattice import Fence, Measurements
 from localization.tracking.range_tracker import Track
@@ -18,11 +19,12 @@ if TYPE_CHECKING:
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")  # told apart without colour vision
 STYLES = ("-", "--", "-.", ":", "-")
 MARKERS = ("o", "s", "D", "^", "v")
-CONFIDENCE = 5.991  # 95 % quantile of chi-square with two degrees of freedom
+ELLIPSES = 40  # knots of a track that get one
 
 
 def plot_tracks(recording: UwbRecording, tracks: Mapping[str, Track]) -> Figure:
-    """Anchors, truth and tracks from above; where there is truth, horizontal error over time below.
+    """Anchors, truth and tracks from above, with 95 % ellipses where a track has covariances; where there is truth,
+    horizontal error over time below.
 
     Args:
         tracks: by label.
@@ -41,6 +43,9 @@ def plot_tracks(recording: UwbRecording, tracks: Mapping[str, Track]) -> Figure:
         color, style = COLORS[k % len(COLORS)], STYLES[k % len(STYLES)]
         xy = made.estimate.value
         above.plot(xy[:, 0], xy[:, 1], color=color, ls=style, lw=1.2, label=label)
+        if made.covariance is not None:
+            chosen = np.unique(np.linspace(0, len(xy) - 1, ELLIPSES).astype(int))
+            draw_ellipses(above, xy[chosen, :2], made.covariance[chosen], color)
         if truth is not None and below is not None:
             time = made.estimate.time
             inside = (time >= truth.time[0]) & (time <= truth.time[-1])
@@ -139,9 +144,5 @@ def _draw_estimate(
         tips = robot[:, :2] + np.column_stack([np.cos(robot[:, 2]), np.sin(robot[:, 2])])
         for start, tip in zip(robot, tips, strict=True):
             axes.plot([start[0], tip[0]], [start[1], tip[1]], color=color, lw=1.2, zorder=4)
-    if covariance is None:
-        return
-    angle = np.linspace(0, 2 * np.pi, 60)
-    circle = np.sqrt(CONFIDENCE) * np.column_stack([np.cos(angle), np.sin(angle)])
-    for place, root in zip(robot, np.linalg.cholesky(covariance), strict=True):
-        axes.plot(*(place[:2] + circle @ root.T).T, color=color, lw=0.9, alpha=0.8, zorder=4)
+    if covariance is not None:
+        draw_ellipses(axes, robot[:, :2], covariance, color)

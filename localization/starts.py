@@ -51,7 +51,9 @@ def starting_values(graph: PoseGraph, first: Mapping[str, Any] | None = None) ->
     return choose_start(graph, first=first).values
 
 
-def choose_start(graph: PoseGraph, initial: Initial = "auto", first: Mapping[str, Any] | None = None) -> Start:
+def choose_start(
+    graph: PoseGraph, initial: Initial = "auto", first: Mapping[str, Any] | None = None, solver: str = "gauss-newton"
+) -> Start:
     """Poses and landmarks to start from.
 
     A chain starts where a pose has a prior, at a pose of `first`, or at the identity. It prefers relative poses between
@@ -64,6 +66,7 @@ def choose_start(graph: PoseGraph, initial: Initial = "auto", first: Mapping[str
             by linear least squares over all relative poses; ``ls``: positions by linear least squares under the
             orientations of the file, else of the chain; ``auto``: the file's where there are any, else the chain.
         first: poses by key, (3,) or (7,), where chains start.
+        solver: of the linear problems.
 
     Raises:
         UnknownNameError: a key of `first` that is no pose.
@@ -85,8 +88,8 @@ def choose_start(graph: PoseGraph, initial: Initial = "auto", first: Mapping[str
     if name in ("chordal", "ls"):
         _require_joined(graph, name)
         base = poses if graph.initial is None else space.normalize_array(np.array(graph.initial, dtype=float))
-        turned = _chordal_orientations(graph, base) if name == "chordal" else orientations_of(graph, poses)
-        poses = _stored(graph, _linear_positions(graph, turned, base), turned)
+        turned = _chordal_orientations(graph, base, solver) if name == "chordal" else orientations_of(graph, poses)
+        poses = _stored(graph, _linear_positions(graph, turned, base, solver), turned)
     values, found = {"pose": poses}, ""
     if len(graph.landmark_keys):
         if graph.landmark_initial is not None and name == "file":
@@ -250,7 +253,7 @@ def _held_at(element: Any, value: Any) -> Any:
     return element - value
 
 
-def _chordal_orientations(graph: PoseGraph, poses: np.ndarray) -> np.ndarray:
+def _chordal_orientations(graph: PoseGraph, poses: np.ndarray, solver: str) -> np.ndarray:
     """Orientations (n, d, d): linear least squares over matrices, projected to rotations.
 
     Rows of the matrices do not interact: the problem has one variable per pose and row.
@@ -278,7 +281,7 @@ def _chordal_orientations(graph: PoseGraph, poses: np.ndarray) -> np.ndarray:
     if held.size:
         value = problem.data("held_at", d, d * held.size, start[held].reshape(-1, d))
         problem.equality("held", _held_at, row[rows_of(held)], value)
-    solution = _solved(problem, {"row": start.reshape(-1, d)}, graph)
+    solution = _solved(problem, {"row": start.reshape(-1, d)}, graph, solver)
     left, _, right = np.linalg.svd(solution["row"].reshape(count, d, d))
     proper = np.ones((count, d))
     proper[:, -1] = np.linalg.det(left @ right)
@@ -289,7 +292,7 @@ def _angular_sigma(information: np.ndarray, d: int) -> np.ndarray:
     return 1 / np.sqrt(np.trace(information[:, d:, d:], axis1=1, axis2=2) / (information.shape[1] - d))
 
 
-def _linear_positions(graph: PoseGraph, turned: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def _linear_positions(graph: PoseGraph, turned: np.ndarray, poses: np.ndarray, solver: str) -> np.ndarray:
     """Positions (n, d) by linear least squares under known orientations (n, d, d)."""
     d, edges, priors = graph.dimension, graph.relative_poses, graph.pose_priors
     problem = Problem("positions under known orientations")
@@ -312,11 +315,11 @@ def _linear_positions(graph: PoseGraph, turned: np.ndarray, poses: np.ndarray) -
     if held.size:
         value = problem.data("held_at", d, held.size, poses[held, :d])
         problem.equality("held", _held_at, place[held], value)
-    return _solved(problem, {"place": poses[:, :d]}, graph)["place"]
+    return _solved(problem, {"place": poses[:, :d]}, graph, solver)["place"]
 
 
-def _solved(problem: Problem, initial: dict[str, np.ndarray], graph: PoseGraph) -> Solution:
-    solution = problem.compile("gauss-newton").solve(initial=initial)
+def _solved(problem: Problem, initial: dict[str, np.ndarray], graph: PoseGraph, solver: str) -> Solution:
+    solution = problem.compile(solver).solve(initial=initial)
     if not np.isfinite(solution.point).all() or str(solution.status) in ("failed", "unbounded", "infeasible"):
         raise DataError(f"{graph.name}: {problem.name} not found: {solution.status}, {solution.message}")
     return solution

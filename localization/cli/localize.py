@@ -11,7 +11,8 @@ import typer
 def localize(
     path: Annotated[Path, typer.Argument(help="Recording: a folder or file in a known layout.")],
     method: Annotated[
-        list[str] | None, typer.Option(help="mhe, fixed_lag, ls, ml; may be repeated; mhe by default.")
+        list[str] | None,
+        typer.Option(help="mhe, fixed_lag, ls, ml; may be repeated. By default mhe for UWB recordings, ml for graphs."),
     ] = None,
     solver: Annotated[str, typer.Option(help="Solver of all methods.")] = "auto",
     settings: Annotated[
@@ -21,12 +22,16 @@ def localize(
     seed: Annotated[int, typer.Option(min=0, help="Of coarse fixes drawn around the truth.")] = 0,
     out: Annotated[
         Path | None,
-        typer.Option(help="Write the poses of the first method, with the recording's stamps in s: .csv or .tum."),
+        typer.Option(help="Write the poses of the first method: .csv (with covariances), .tum, or .g2o for graphs."),
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw into this file (png, svg, pdf).")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """Localize a recording; print errors where there is truth, and ratios to published figures where there are any."""
+    """Localize a recording: UWB folders, g2o and PyFG graphs.
+
+    Prints errors where there is truth, ratios to published figures where there are any, and for graphs the measurements
+    that contradict the others most.
+    """
     from problems import registry
     from problems.bench.export import as_json as to_json
     from problems.bench.measure import measure
@@ -44,12 +49,22 @@ def localize(
         if "path" in given:
             raise SettingError(f"the recording is the argument {path}; --set path={given['path']} names another")
         scenario = registry.load("scenarios", "recording")
-        values = complete(scenario, {"path": str(path)} | given | ({"covariance": True} if out is not None else {}))
-        methods = method or [scenario.methods[0]]
-        plan = plan_of_names(["recording"], methods, [solver], {k: [v] for k, v in values.items()}, seed=seed, trials=1)
-        jobs = plan.jobs()  # unknown names stop here
+        wanted = {"covariance": True} if out is not None or plot is not None else {}
+        values = complete(scenario, {"path": str(path)} | wanted | given)
+
+        def planned(methods: list[str]) -> Any:
+            return plan_of_names(
+                ["recording"], methods, [solver], {k: [v] for k, v in values.items()}, seed=seed, trials=1
+            )
+
+        planned(method or [scenario.methods[0]])  # unknown names stop here
         checked = validated(scenario, values)
         drawn = scenario.draw(checked, trial_rng(seed, scenario.name, 0))  # an unreadable file stops here
+        methods = method or [drawn.kind.methods[0]]
+        for name in methods:
+            scenario.require_method(drawn, name)
+        _check_suffix(out, drawn)
+        jobs = planned(methods).jobs()
         rows, outcomes = [], {}
         for row, outcome in progress(map(measure, jobs), len(jobs), "localize"):
             rows.append(row)
@@ -57,14 +72,18 @@ def localize(
                 outcomes[row.job.method] = outcome
         facts = describe(scenario)
         summaries = summarize(rows)
-        give(to_json(summaries, {"recording": facts}, 1, values))
+        edges = {m: getattr(o.trace, "edges", []) for m, o in outcomes.items()}
+        told = [{"method": m, **edge} for m, listed in edges.items() for edge in listed]
+        give(to_json(summaries, {"recording": facts}, 1, values) | ({"edges": told} if told else {}))
         if not as_json:
-            print_summaries(summaries)
-        for told in dict.fromkeys(warning for row in rows for warning in row.warnings):
-            error_console().print(told, style="yellow", soft_wrap=True)
+            print_summaries([_known(summary) for summary in summaries])
+            _print_options(summaries)
+            _print_edges(told)
+        for warned in dict.fromkeys(warning for row in rows for warning in row.warnings):
+            error_console().print(warned, style="yellow", soft_wrap=True)
         if out is not None and methods[0] in outcomes:
-            _write(out, drawn.recording, outcomes[methods[0]].trace)
-            error_console().print(f"poses of {methods[0]}: {out}", soft_wrap=True)
+            for written in _write(out, drawn, outcomes[methods[0]].trace):
+                error_console().print(f"poses of {methods[0]}: {written}", soft_wrap=True)
         if plot is not None and outcomes:
             _draw(plot, scenario.plot(checked, drawn, outcomes))
             error_console().print(f"picture: {plot}", soft_wrap=True)
@@ -80,8 +99,8 @@ def _check_targets(out: Path | None, plot: Path | None) -> None:
     for target in (out, plot):
         if target is not None and not target.absolute().parent.is_dir():
             raise WriteError(target, "its folder does not exist")
-    if out is not None and out.suffix.lower() not in (".csv", ".tum"):
-        raise SettingError(f"--out {out}: poses are written as .csv or .tum")
+    if out is not None and out.suffix.lower() not in (".csv", ".tum", ".g2o"):
+        raise SettingError(f"--out {out}: poses are written as .csv, .tum or .g2o")
     if plot is not None:
         from matplotlib.backend_bases import FigureCanvasBase
 
@@ -99,21 +118,75 @@ def _draw(path: Path, figure: Any) -> None:
         raise WriteError(path, str(error)) from error
 
 
-def _write(path: Path, recording: Any, made: Any) -> None:
-    """Poses of a planar track; a tag has no heading."""
+def _check_suffix(out: Path | None, drawn: Any) -> None:
+    from problems.errors import SettingError
+
+    if out is not None and out.suffix.lower() not in drawn.kind.outputs:
+        raise SettingError(f"--out {out}: poses of {drawn.kind.what} are written as {' or '.join(drawn.kind.outputs)}")
+
+
+def _known(summary: Any) -> Any:
+    """A summary without the metrics that its kind of recording does not have."""
+    from dataclasses import replace
+
+    return replace(summary, metrics={name: value for name, value in summary.metrics.items() if value is not None})
+
+
+def _print_options(summaries: Any) -> None:
+    """How each row was made: where it started, what was placed, how well it fits."""
+    from problems.bench.settings import as_text
+    from problems.cli.output import console
+
+    for row in summaries:
+        known = ", ".join(f"{key} {as_text(value)}" for key, value in row.options.items() if value is not None)
+        console().print(f"{row.method}: {known}", soft_wrap=True)
+
+
+def _print_edges(edges: list[dict[str, Any]]) -> None:
+    from problems.bench.export import number
+    from problems.cli.output import console, table
+
+    if not edges:
+        return
+    keys = ("squared", "p_value", "weight", "redundancy", "statistic", "p_against_others")
+    numeric = ("squared", "p", "weight", "redundancy", "against others", "p against others")
+    made = table(
+        "measurements that contradict the others most", ["method", "term", "row", "between", *numeric], numeric
+    )
+    for edge in edges:
+        made.add_row(
+            edge["method"], edge["term"], str(edge["row"]), " ".join(edge["between"]),
+            *(number(edge[key]) for key in keys),
+        )  # fmt: skip
+    console().print(made)
+
+
+def _write(path: Path, drawn: Any, made: Any) -> list[Path]:
+    """Write poses by suffix; a TUM file holds one trajectory, so that several robots get a file each."""
     import numpy as np
 
-    from localization.io.poses import Poses, write_poses, write_tum
+    from localization.io import g2o
+    from localization.io.poses import write_poses, write_tum
     from problems.errors import WriteError
 
-    count = len(made.estimate)
-    covariance = None
-    if made.covariance is not None:
-        covariance = np.full((count, 3, 3), np.nan)
-        covariance[:, :2, :2] = made.covariance
-    stamps = recording.start * 1e-9 + made.estimate.time
-    poses = Poses(stamps, np.full(count, "tag"), made.estimate.value, np.full((count, 1), np.nan), covariance)
+    suffix = path.suffix.lower()
     try:
-        (write_tum if path.suffix.lower() == ".tum" else write_poses)(path, poses)
+        if suffix == ".g2o":
+            g2o.write(path, drawn.kind.localized(drawn.recording, made))
+            return [path]
+        poses = drawn.kind.poses(drawn.recording, made)
+        if suffix == ".csv":
+            write_poses(path, poses)
+            return [path]
+        robots = getattr(drawn.recording, "robots", np.zeros(0))
+        names = np.unique(robots)
+        if len(names) < 2:
+            write_tum(path, poses)
+            return [path]
+        written = []
+        for name in names:
+            written.append(path.with_name(f"{path.stem}-{name}{path.suffix}"))
+            write_tum(written[-1], poses.chosen(np.flatnonzero(robots == name)))
+        return written
     except OSError as error:
         raise WriteError(path, str(error)) from error

@@ -64,6 +64,11 @@ class Poses:
         """2 or 3."""
         return self.position.shape[1]
 
+    def chosen(self, rows: np.ndarray) -> Poses:
+        """Some of the rows."""
+        covariance = None if self.covariance is None else self.covariance[rows]
+        return Poses(self.time[rows], self.keys[rows], self.position[rows], self.orientation[rows], covariance)
+
 
 def _columns(dimension: int, covariance: bool) -> tuple[str, ...]:
     axes = _AXES[dimension]

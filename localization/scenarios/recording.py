@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 import pydantic
 
 from localization.io.detect import open_recording
-from localization.io.recording import TimeSeries, UwbRecording
-from localization.io.scoring import scoring_window, uwb_scores
-from localization.tracking.batch_track import batch_track, snapshot_track
-from localization.tracking.range_tracker import RangeTrackerSettings, Track, first_position, track
+from localization.io.poses import Poses
+from localization.io.recording import PoseGraph, UwbRecording
+from localization.scenarios._recording_graph import GraphMethods
+from localization.scenarios._recording_uwb import UwbMethods, coarse_fixes
 from problems.bench.scenario import Outcome
-from problems.errors import DataError, FormError, ModelWarning, SettingError
+from problems.errors import FormError, SettingError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TRACKER = (
-    "horizon", "period", "acceleration", "range_sigma", "loss", "height", "bias", "bias_mean", "bias_sigma", "lag",
-    "gps_sigma", "iterations", "capacity",
-)  # fmt: skip
+__all__ = ["Drawn", "Kind", "RecordingScenario", "Settings", "coarse_fixes", "scenario"]
 
 
 class Settings(pydantic.BaseModel):
@@ -37,7 +33,9 @@ class Settings(pydantic.BaseModel):
         None, description="published scoring window; by default from the folder's name, else the whole truth"
     )
     start: Literal["ranges", "truth"] | tuple[float, float] = pydantic.Field(
-        "ranges", description="first position: from the first ranges, from truth, or [x, y] in m"
+        "ranges",
+        description="UWB: first position from the first ranges, from truth, or [x, y] in m; graphs: truth puts the "
+        "first pose of every robot at its recorded place",
     )
     horizon: int = pydantic.Field(20, ge=1, le=1000, description="transitions in the window")
     period: float = pydantic.Field(0.1, gt=0, description="between knots, s")
@@ -56,7 +54,32 @@ class Settings(pydantic.BaseModel):
     capacity: int = pydantic.Field(2, ge=1, description="ranges of one anchor that a knot can hold")
     gps_rate: float = pydantic.Field(0.0, ge=0, description="coarse fixes drawn around the truth, Hz; 0 for none")
     gps_sigma: float = pydantic.Field(2.0, gt=0, description="of those fixes, m per axis")
-    covariance: bool = pydantic.Field(False, description="compute the covariance of every position (mhe, fixed_lag)")
+    covariance: bool = pydantic.Field(False, description="compute the covariance of every pose (not by ls)")
+    chart: Literal["gtsam", "plain"] = pydantic.Field(
+        "gtsam", description="graphs: residual of relative poses; gtsam is the full logarithm. Their optima differ"
+    )
+    initial: Literal["auto", "file", "odometry", "chordal", "ls"] = pydantic.Field(
+        "auto", description="graphs: start at the file's vertices, chained odometry, or linear least squares"
+    )
+    starts: int = pydantic.Field(
+        1, ge=1, le=20, description="graphs: solve from so many different starts and keep the cheapest optimum"
+    )
+    robust: Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"] = pydantic.Field(
+        "none", description="graphs: loss on what robust_on says"
+    )
+    robust_on: Literal["all", "odometry", "loop_closures", "sightings", "ranges"] = pydantic.Field(
+        "all", description="graphs: measurements that get the robust loss"
+    )
+    robust_scale: float | None = pydantic.Field(None, gt=0, description="graphs: of that loss, sigmas")
+    graduated: bool = pydantic.Field(False, description="graphs: graduated non-convexity (gauss-newton)")
+    odometry_scale: float = pydantic.Field(1.0, gt=0, description="graphs: factor of the sigmas of odometry")
+    fence: tuple[float, float, float, float] | None = pydantic.Field(
+        None, description="graphs: [x, y] lowest and [x, y] highest position of every pose, m"
+    )
+    edges: int = pydantic.Field(10, ge=0, description="graphs: how many of the worst measurements are listed")
+    tolerance: float = pydantic.Field(1e-8, gt=0, description="graphs: of the solver")
+    iteration_limit: int = pydantic.Field(1000, ge=1, description="graphs: of the solver")
+    time_limit: float = pydantic.Field(60.0, gt=0, description="graphs: of one solve, s")
 
     @pydantic.model_validator(mode="after")
     def _one_fix_per_knot(self) -> Settings:
@@ -65,116 +88,88 @@ class Settings(pydantic.BaseModel):
         return self
 
 
+class Kind(Protocol):
+    """Methods for one kind of recording.
+
+    Attributes:
+        what: the kind, for messages. methods: their names, the default one first.
+        settings: names of settings that mean something. outputs: suffixes that poses can be written with.
+    """
+
+    what: str
+    methods: tuple[str, ...]
+    settings: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def prepare(self, settings: Any, recording: Any, rng: np.random.Generator) -> Any: ...
+    def run(self, settings: Any, method: str, solver: str, recording: Any, prepared: Any) -> Outcome: ...
+    def plot(self, recording: Any, traces: dict[str, Any]) -> Figure: ...
+    def poses(self, recording: Any, made: Any) -> Poses: ...
+
+
+KINDS: dict[type, Any] = {UwbRecording: UwbMethods, PoseGraph: GraphMethods}
+
+
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A recording and the coarse fixes drawn for it."""
+    """A recording, its kind, and what its kind prepared for all methods (coarse fixes of UWB recordings)."""
 
-    recording: UwbRecording
-    fixes: TimeSeries | None
+    recording: Any
+    kind: Any
+    prepared: Any
+
+    @property
+    def fixes(self) -> Any:
+        """Coarse fixes, where there are any."""
+        return self.prepared
 
 
 class RecordingScenario:
-    """See the module."""
+    """See the module. Which methods there are depends on the recording; the first one of its kind is the default."""
 
     name = "recording"
-    source = "spec recordings 1 and 6"
+    source = "spec recordings 1 to 6"
     methods = ("mhe", "fixed_lag", "ls", "ml")
-    metrics = ("rmse_2d", "ratio_to_eskf", "ratio_to_ls", "objective", "keyframes", "measurements")
+    metrics = (
+        "rmse_2d", "ratio_to_eskf", "ratio_to_ls", "ate", "objective", "start_objective", "ls_objective",
+        "gradient_norm", "keyframes", "measurements",
+    )  # fmt: skip
     settings = Settings
 
     def draw(self, settings: Settings, rng: np.random.Generator) -> Drawn:
-        recording = open_recording(settings.path, **_given(trajectory=settings.trajectory))
-        if not isinstance(recording, UwbRecording):
+        given = {} if settings.trajectory is None else {"trajectory": settings.trajectory}
+        recording = open_recording(settings.path, **given)
+        kind = KINDS.get(type(recording))
+        if kind is None:
+            known = ", ".join(each.what for each in KINDS.values())
+            raise FormError(f"{settings.path}: read as {type(recording).__name__}; what can be localized: {known}")
+        self._require_meaning(settings, kind)
+        return Drawn(recording, kind, kind.prepare(settings, recording, rng))
+
+    def require_method(self, drawn: Drawn, method: str) -> None:
+        """Raises FormError where the recording's kind has no such method; names those it has."""
+        if method not in drawn.kind.methods:
             raise FormError(
-                f"{settings.path}: read as {type(recording).__name__}; only UWB recordings can be localized so far"
+                f"method {method!r} cannot localize {drawn.kind.what} ({drawn.recording.name}); possible: "
+                f"{', '.join(drawn.kind.methods)}"
             )
-        if recording.truth is None and (settings.start == "truth" or settings.gps_rate > 0):
-            key = "start=truth" if settings.start == "truth" else "gps_rate"
-            raise SettingError(f"{settings.path}: {key} needs truth, which this recording does not have")
-        if settings.trajectory is not None and recording.truth is not None:
-            scoring_window(recording)  # the other trajectory is noticed before any work
-        return Drawn(recording, coarse_fixes(recording, settings.gps_rate, settings.gps_sigma, rng))
 
     def run(self, settings: Settings, method: str, solver: str, drawn: Drawn) -> Outcome:
-        recording, fixes = drawn.recording, drawn.fixes
-        values = {key: getattr(settings, key) for key in TRACKER}
-        tuned = RangeTrackerSettings(**values, delay=settings.delay if method == "fixed_lag" else 0.0)
-        chosen = "gauss-newton" if solver == "auto" else solver
-        start = _start(settings, recording, tuned)
-        if method == "ls":
-            made = snapshot_track(recording, start, tuned, chosen)
-        elif method == "ml":
-            made = batch_track(recording, start, tuned, fixes, chosen)
-        else:
-            made = track(recording, start, tuned, fixes, chosen, covariances=settings.covariance)
-        return Outcome(
-            metrics=_metrics(recording, made, tuned, fixes),
-            options={"prior": "filter" if method in ("mhe", "fixed_lag") else "none", "delay": tuned.delay},
-            times={"compile": made.compile_seconds, "solve": float(made.step_seconds.sum())},
-            step_seconds=made.step_seconds,
-            status=made.status,
-            iterations=made.iterations,
-            residual=made.residual,
-            trace=made,
-        )
+        self.require_method(drawn, method)
+        return drawn.kind.run(settings, method, solver, drawn.recording, drawn.prepared)
 
     def plot(self, settings: Settings, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
-        from localization.plots import plot_tracks
+        return drawn.kind.plot(drawn.recording, {label: o.trace for label, o in outcomes.items()})
 
-        return plot_tracks(drawn.recording, {label: o.trace for label, o in outcomes.items()})
-
-
-def coarse_fixes(recording: UwbRecording, rate: float, sigma: float, rng: np.random.Generator) -> TimeSeries | None:
-    """Position fixes (m, 2) at `rate` (Hz): truth plus white noise of `sigma` (m); None without rate or truth."""
-    truth = recording.truth
-    if rate <= 0 or truth is None:
-        return None
-    first, last = max(truth.time[0], recording.time[0]), min(truth.time[-1], recording.time[-1])
-    times = np.arange(first, last, 1.0 / rate)
-    places = np.column_stack([np.interp(times, truth.time, truth.value[:, k]) for k in (0, 1)])
-    return TimeSeries(times, places + sigma * rng.normal(size=places.shape))
-
-
-def _start(settings: Settings, recording: UwbRecording, tuned: RangeTrackerSettings) -> np.ndarray:
-    if settings.start == "ranges":
-        return first_position(recording, tuned)
-    if settings.start == "truth":
-        assert recording.truth is not None
-        return recording.truth.value[0, :2]
-    return np.array(settings.start)
-
-
-def _metrics(
-    recording: UwbRecording, made: Track, tuned: RangeTrackerSettings, fixes: TimeSeries | None
-) -> dict[str, float | None]:
-    count = len(made.estimate)
-    measured = len(recording.time) + (2 * len(fixes) if fixes is not None else 0)
-    out: dict[str, float | None] = dict.fromkeys(RecordingScenario.metrics)
-    out |= {"objective": made.objective, "keyframes": float(count), "measurements": float(measured)}
-    if recording.truth is None:
-        return out
-    position = np.column_stack([made.estimate.value, np.full(count, tuned.height)])
-    try:
-        out["rmse_2d"] = scored = uwb_scores(recording, TimeSeries(made.estimate.time, position))["rmse_2d"]
-    except DataError as error:  # the track is worth having without a score
-        warnings.warn(f"not scored: {error}", ModelWarning, stacklevel=2)
-        return out
-    if recording.figures and recording.trajectory is None:
-        warnings.warn(
-            f"{recording.name}: scored over all of its truth and not compared with the published figures, which count "
-            "inside a window; choose it by --set trajectory=A or B",
-            ModelWarning,
-            stacklevel=2,
-        )
-        return out
-    for method, figures in recording.figures.items():
-        if f"ratio_to_{method}" in out and "rmse_2d" in figures:
-            out[f"ratio_to_{method}"] = scored / figures["rmse_2d"]
-    return out
-
-
-def _given(**settings: Any) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if value is not None}
+    @staticmethod
+    def _require_meaning(settings: Settings, kind: Any) -> None:
+        """Raises SettingError for a setting that is not its default and that the kind of recording does not know."""
+        for name, info in Settings.model_fields.items():
+            changed = name != "path" and getattr(settings, name) != info.get_default()
+            if changed and name not in kind.settings:
+                raise SettingError(
+                    f"setting {name} means nothing for {kind.what}; those that do: {', '.join(kind.settings)}"
+                )
 
 
 scenario = RecordingScenario()
