@@ -33,8 +33,8 @@ class SporadicDesign:
     """Model, network and options of an estimator with detections, checked.
 
     Args:
-        model: linear, without inputs, with a prior and the sensors of all nodes. A camera is one sensor of the model for
-            each vehicle: detections are flagged sensor by sensor.
+        model: linear, without inputs, with a prior and the sensors of all nodes. A camera is one sensor of the model
+            for each vehicle: detections are flagged sensor by sensor.
         network: who hears whom; strongly connected.
         method: ``dmhe_w_pre``, ``dmhe_w_pre_s``, ``dmhe_f``, ``dmhe_f_s``, or options.
         placement: label of the node that each sensor belongs to; by default sensors are shared out evenly and in order
@@ -288,9 +288,9 @@ class SporadicDesign:
             radius = max(radius, float(np.abs(np.linalg.eigvals(coefficients.matrix())).max()))
         if radius > 1 + 1e-9:
             warnings.warn(
-                f"weight_fusion={self.options.weight_fusion!r} with {self.options.weights} weights: the spectral radius "
-                f"of [n_S^j k_ij^2] is {radius:.4g} > 1, covariances of what nobody sees grow by it every step; they are "
-                f"capped at {self.options.covariance_cap:g}. weight_fusion='convex' has no such growth",
+                f"weight_fusion={self.options.weight_fusion!r} with {self.options.weights} weights: the spectral "
+                f"radius of [n_S^j k_ij^2] is {radius:.4g} > 1, covariances of what nobody sees grow by it every step; "
+                f"they are capped at {self.options.covariance_cap:g}. weight_fusion='convex' has no such growth",
                 ModelWarning,
                 stacklevel=3,
             )

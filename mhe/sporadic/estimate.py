@@ -17,7 +17,7 @@ class DetectionEstimate(Estimate):
         detected: (own sensors,) flags of this instant; the node is active where any is 1.
         rank: rho_O of its neighbourhood; None without rank weights.
         weights: (members,) consensus weights used, zero for neighbours that were left out; None where none were needed.
-        arrival_covariance: (n, n) Pi_bar of the first state of the window.
+        arrival_covariance: (parts, m, m) Pi_bar of the first state of the window, by part of the model (vehicle).
         unseen: (parts,) steps since anyone of the neighbourhood detected the part (a vehicle), counted from the first
             step where nobody did.
         outside: (own sensors,) how far the reading lies outside the sensor's set, 0 where it is inside or missing.

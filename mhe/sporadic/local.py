@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from mhe.sporadic.plan import SporadicPlan
 from mhe.sporadic.pool import DetectionPool
 from mhe.sporadic.readings import Slots
 from mhe.sporadic.rows import half_planes
+from problems.forms.layout import INFINITE
 from problems.solvers.base import Status
 from problems.solvers.session import Session
 
@@ -31,6 +33,7 @@ class LocalProblem:
         self._plan, self._pool, self._numbers = plan, pool, numbers
         self._session = pool.get(plan.shape, plan.noise_gain, plan.noise, plan.options).fork()
         self._relaxed: Session | None = None
+        self._shape = plan.shape.horizon + 1, plan.blocks.count, plan.blocks.size
         self._rows = _row_data(plan)
         if self._rows:
             self._session.update(**self._rows)
@@ -38,23 +41,23 @@ class LocalProblem:
         self._row_sensors = plan.row_sensors.ravel()
 
     def solve(
-        self, slots: Slots, reference: np.ndarray, information: np.ndarray, states: np.ndarray
+        self, slots: Slots, reference: np.ndarray, information: np.ndarray, predict: Callable[[], np.ndarray]
     ) -> tuple[np.ndarray, Status, tuple[str, ...]]:
         """States of all slots, status, and sensors whose rows are not met.
 
         Args:
             slots: readings of the region.
             reference, information: of the arrival cost, (parts, m) and (parts, m, m).
-            states: (slots, parts, m) where nothing better is found.
+            predict: states (slots, parts, m) for where nothing better is found.
         """
         plan, numbers = self._plan, self._numbers
         m, flags = plan.blocks.size, slots.flags[1:]
         data: dict[str, Any] = {
             "reference": reference,
-            "arrival information": information,
-            "reading information": numbers.information(flags).reshape(-1, m, m),
+            "arrival information": information.reshape(-1, m * m),
+            "reading information": numbers.information(flags).reshape(-1, m * m),
             "reading linear": numbers.linear(slots.values[1:]).reshape(-1, m),
-            "transition": numbers.transitions(flags[:-1]).reshape(-1, m, m),
+            "transition": numbers.transitions(flags[:-1]).reshape(-1, m * m),
             "moved": numbers.moved(slots.fed[1:-1]).reshape(-1, m),
         }
         active = None
@@ -65,34 +68,36 @@ class LocalProblem:
         status = solution.status
         if status in SOLVED or (status in STOPPED and solution.iterations):
             if plan.options.rows == "soft" and status in SOLVED and solution.method != "linear" and self._too_dear():
-                return self._soft(data, states)
-            return solution["x"].reshape(states.shape), status, ()
+                return self._soft(data, predict)
+            return solution["x"].reshape(self._shape), status, ()
         if status is not Status.INFEASIBLE:
-            return states, Status.FAILED if status in STOPPED else status, ()
+            return predict(), Status.FAILED if status in STOPPED else status, ()
         if plan.options.rows == "soft" or plan.options.unmet == "soft":
-            return self._soft(data, states)
+            return self._soft(data, predict)
         assert active is not None
         concerned = np.unique(self._row_sensors[active.any(axis=0)])
-        return states, status, tuple(plan.names[sensor] for sensor in concerned)
+        return predict(), status, tuple(plan.names[sensor] for sensor in concerned)
 
     def _too_dear(self) -> bool:
         """Whether meeting the rows costs more than the penalty, so that the soft problem differs from the hard one."""
         last: Any = getattr(self._session, "last", None)
         return last is None or np.abs(last[1]).max(initial=0.0) > self._plan.options.penalty
 
-    def _soft(self, data: dict[str, Any], states: np.ndarray) -> tuple[np.ndarray, Status, tuple[str, ...]]:
+    def _soft(
+        self, data: dict[str, Any], predict: Callable[[], np.ndarray]
+    ) -> tuple[np.ndarray, Status, tuple[str, ...]]:
         plan = self._plan
         if self._relaxed is None:
             self._relaxed = self._pool.get(plan.shape, plan.noise_gain, plan.noise, plan.options, soft=True).fork()
             self._relaxed.update(**self._rows)
         solution = self._relaxed.solve(data)
         if solution.status not in SOLVED:
-            return states, solution.status, ()
-        slack = solution["field of view slack"].max(axis=1).reshape(len(states), -1)
+            return predict(), solution.status, ()
+        slack = solution["field of view slack"].max(axis=1).reshape(self._shape[0], -1)
         slack[data["row active"].reshape(slack.shape) == 0] = 0.0
         concerned = np.unique(self._row_sensors[(slack > RELAXED).any(axis=0)])
         unmet = tuple(plan.names[sensor] for sensor in concerned)
-        return solution["x"].reshape(states.shape), Status.INFEASIBLE if unmet else solution.status, unmet
+        return solution["x"].reshape(self._shape), Status.INFEASIBLE if unmet else solution.status, unmet
 
 
 def _row_data(plan: SporadicPlan) -> dict[str, np.ndarray]:
@@ -101,7 +106,7 @@ def _row_data(plan: SporadicPlan) -> dict[str, np.ndarray]:
     if not shape.sets:
         return {}
     H = np.zeros((*plan.row_sensors.shape, shape.rows, shape.size))
-    h = np.full((*plan.row_sensors.shape, shape.rows), np.inf)
+    h = np.full((*plan.row_sensors.shape, shape.rows), INFINITE)
     for place in np.argwhere(plan.row_sensors >= 0):
         sensor = plan.row_sensors[tuple(place)]
         polyhedron = plan.sets[sensor]

@@ -104,6 +104,7 @@ class SporadicNode:
         ]
         self._slots.advance(instant)
         self._time, self._too_late, self._late = float(time), 0, []
+        self._fresh: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._detected, self._outside = flags, self._distance(values, flags)
         self._enter(plan.index, instant, values, flags)
         said = []
@@ -113,7 +114,7 @@ class SporadicNode:
         if state is None or covariance is None:
             said.append(reading.message(instant=instant, flags=alpha, y=y))
         else:
-            self._memory.receive(plan.index, self._time, state, covariance)
+            self._take(plan.index, self._time, state, covariance)
             packed = covariance.ravel()[self._triangle].ravel()
             said.append(full.message(instant=instant, flags=alpha, y=y, state=state.ravel(), covariance=packed))
         for then, y_then, mask in late:
@@ -146,8 +147,8 @@ class SporadicNode:
             self._published = plan.mean
         else:
             weights = self._arrival()
-            before = self._predicted()
-            self._states, status, unmet = self._local.solve(slots, self._reference, inverse(self._fused), before)
+            information = inverse(self._fused)
+            self._states, status, unmet = self._local.solve(slots, self._reference, information, self._predicted)
             self._published = self._states[1 if newest == self._horizon else 0].copy()
         self._count_unseen()
         rank = self._ranks.get(plan.index)
@@ -166,7 +167,7 @@ class SporadicNode:
             detected=self._detected,
             rank=None if rank is None else int(rank[1]),
             weights=weights,
-            arrival_covariance=self._spread(self._fused),
+            arrival_covariance=self._fused,
             unseen=self._unseen.copy(),
             outside=self._outside,
             too_late=self._too_late,
@@ -221,7 +222,13 @@ class SporadicNode:
                 shape = self._plan.transition.shape
                 state = values["state"].reshape(shape[:2])
                 covariance = values["covariance"].reshape(shape[0], -1)[:, self._square]
-                self._memory.receive(sender, message.time, state, covariance)
+                self._take(sender, message.time, state, covariance)
+
+    def _take(self, member: int, time: float, state: np.ndarray, covariance: np.ndarray) -> None:
+        """Keep what a member published."""
+        self._memory.receive(member, time, state, covariance)
+        if time == self._time:
+            self._fresh[member] = state, covariance
 
     def _propagate(self, state: np.ndarray, age: int) -> np.ndarray:
         """A neighbour's published state of `age` steps ago, brought to the first instant of the present window."""
@@ -231,7 +238,7 @@ class SporadicNode:
         return state
 
     def _moved_on(self, state: np.ndarray) -> np.ndarray:
-        return np.einsum("vij,vj->vi", self._plan.transition, state)
+        return _applied(self._plan.transition, state)
 
     # Arrival cost
 
@@ -249,8 +256,8 @@ class SporadicNode:
             return self._published, covariance
         # the filter's update of the arrival mean by the readings of the instant that left
         left = informations[0]
-        innovation = -self._numbers.linear(self._slots.values[:1])[0] - np.einsum("vij,vj->vi", left, self._reference)
-        correction = np.einsum("vij,vj->vi", conditioned(self._fused, left), innovation)
+        innovation = -self._numbers.linear(self._slots.values[:1])[0] - _applied(left, self._reference)
+        correction = _applied(conditioned(self._fused, left), innovation)
         return self._moved_on(self._reference + correction), covariance
 
     def _arrival(self) -> np.ndarray | None:
@@ -261,34 +268,42 @@ class SporadicNode:
             own = plan.mean if self._published is None else self._published
             self._reference, self._fused = (own if rule == "own" else plan.mean), plan.start
             return None
-        try:
-            recall = self._memory.recall(self._time)
-        except DataError:
-            self._alone()
-            return None
-        places = [self._place[member] for member in recall.members]
-        weights = self._weights(recall.members, places)
-        self._reference = np.tensordot(weights, recall.states, 1)
-        used = np.zeros(len(plan.members))
-        used[places] = weights
+        if len(self._fresh) == len(plan.members):
+            states = np.array([self._fresh[member][0] for member in plan.members])
+            covariances = np.array([self._fresh[member][1] for member in plan.members])
+            weights = used = self._weights()
+            factors = weights if plan.listeners is None else plan.listeners * weights**2
+        else:
+            try:
+                recall = self._memory.recall(self._time)
+            except DataError:
+                self._alone()
+                return None
+            assert recall.covariances is not None
+            states, covariances = recall.states, recall.covariances
+            places = [self._place[member] for member in recall.members]
+            # by neighbours left out, the others' weights grow (section 10)
+            weights = normalize_rows(self._weights()[places], [0, len(places)])
+            factors = weights if plan.listeners is None else plan.listeners[places] * weights**2
+            used = np.zeros(len(plan.members))
+            used[places] = weights
+        shape = plan.transition.shape
+        self._reference = (weights @ states.reshape(len(weights), -1)).reshape(shape[:2])
         if growing:
             self._fused = plan.start
             return used
-        assert recall.covariances is not None
-        factors = weights if plan.listeners is None else plan.listeners[places] * weights**2
-        fused = symmetrized(np.tensordot(factors, recall.covariances, 1))
+        fused = symmetrized((factors @ covariances.reshape(len(factors), -1)).reshape(shape))
         self._fused = capped(fused, plan.options.covariance_cap)
         return used
 
-    def _weights(self, members: Sequence[int], places: list[int]) -> np.ndarray:
-        """Weights over the members that are known, summing to 1 (4.13)."""
+    def _weights(self) -> np.ndarray:
+        """Weights of all members, summing to 1 (4.13)."""
         plan = self._plan
         if plan.weights is not None:
-            scores = plan.weights[places]
-        else:
-            floor = plan.options.rank_floor
-            scores = np.array([max(self._ranks.get(member, (0.0, 0.0))[1], floor) for member in members])
-        return normalize_rows(scores, [0, len(members)])
+            return plan.weights
+        floor, ranks = plan.options.rank_floor, self._ranks
+        scores = np.array([max(ranks[member][1], floor) if member in ranks else floor for member in plan.members])
+        return scores / scores.sum()
 
     def _alone(self) -> None:
         """The prior of instant 0 propagated to the first instant of the window, where nothing was ever heard."""
@@ -319,12 +334,10 @@ class SporadicNode:
         self._unseen += 1
         self._unseen[self._plan.parts[flags > 0]] = 0
 
-    def _spread(self, blocks: np.ndarray) -> np.ndarray:
-        """(n, n) from (parts, m, m)."""
-        states = self._plan.blocks.states
-        out = np.zeros((states.size,) * 2)
-        out[states[:, :, None], states[:, None, :]] = blocks
-        return out
+
+def _applied(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Matrices (parts, m, m) times vectors (parts, m)."""
+    return (matrices @ vectors[..., None])[..., 0]
 
 
 def _projections(plan: SporadicPlan) -> list[Projection | None] | None:

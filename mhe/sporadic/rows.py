@@ -12,6 +12,7 @@ import numpy as np
 
 from mhe.polyhedron import Polyhedron
 from problems.errors import DefinitionError
+from problems.forms.layout import INFINITE
 from problems.problem import Problem, Variable
 from problems.soft import Soft
 
@@ -26,12 +27,12 @@ def state_rows(problem: Problem, x: Variable, sets: int, rows: int, penalty: flo
         problem: of the window.
         x: its states, slot after slot.
         sets: sets of rows on one instance.
-        rows: rows of a set; those a set does not need have zeros in H and an infinite h.
+        rows: rows of a set; those a set does not need have zeros in H and the bound `INFINITE` in h.
         penalty: price of slacks, None for hard rows.
     """
     count = x.count * sets
     H = problem.data("row matrix", (rows, x.space.dim), count, value=np.zeros((count, rows, x.space.dim)))
-    h = problem.data("row bound", rows, count, value=np.full((count, rows), np.inf))
+    h = problem.data("row bound", rows, count, value=np.full((count, rows), INFINITE))
     problem.inequality(
         "field of view",
         lambda x, H: H @ x,

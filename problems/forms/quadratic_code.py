@@ -141,12 +141,14 @@ class QuadraticCode:
     def _bounds(self, numbers: np.ndarray, shift: np.ndarray, off: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         l, u = np.zeros(shift.size), np.zeros(shift.size)
         if shift.size > self.equalities:
-            lower, upper = (limit(numbers) for limit in self._limits)
-            l[self.equalities :] = np.where(lower <= -INFINITE, -np.inf, lower)
-            u[self.equalities :] = np.where(upper >= INFINITE, np.inf, upper)
+            lower, upper = l[self.equalities :], u[self.equalities :]
+            for into, limit in zip((lower, upper), self._limits, strict=True):
+                into[...] = limit(numbers)
+            lower[lower <= -INFINITE] = -np.inf
+            upper[upper >= INFINITE] = np.inf
             if off is not None:
-                l[self.equalities :][off] = -np.inf
-                u[self.equalities :][off] = np.inf
+                lower[off] = -np.inf
+                upper[off] = np.inf
         return l - shift, u - shift
 
     # Symbols
