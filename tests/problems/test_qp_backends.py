@@ -865,7 +865,7 @@ def test_hpipm_finds_the_stages() -> None:
             (rescaled, QP(joined, mixed.q, A, l, u), mixed),
             (4, 0, 0),
         ),  # entries that are zero now are no reason to search
-        ((mixed, QP(mixed.P, mixed.q, A, l, loose), mixed), (4, 0, 0)),
+        ((mixed, QP(mixed.P, mixed.q, A, l, loose), mixed), (4, 0, 0)),  # bounds that meet are no reason to search
     ):
         backend = mixed.backend(HPIPM)
         for problem, expected in zip(others, stages, strict=True):
