@@ -863,8 +863,8 @@ def test_hpipm_finds_the_stages() -> None:
         ((mixed, rescaled, mixed), (4, 4, 4)),
         (
             (rescaled, QP(joined, mixed.q, A, l, u), mixed),
-            (4, 0, 0),
-        ),  # entries that are zero now are no reason to search
+            (4, 0, 4),
+        ),
         ((mixed, QP(mixed.P, mixed.q, A, l, loose), mixed), (4, 0, 0)),  # bounds that meet are no reason to search
     ):
         backend = mixed.backend(HPIPM)
