@@ -173,7 +173,7 @@ def _model() -> LinearModel:
     )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)  # a plan has that many solvers, forms and tolerances
 def _estimator(settings: Settings, method: str, solver: str) -> MovingHorizonEstimator:
     observes = method == "mhe_pre"
     options: dict[str, Any] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 from problems.bench.metrics import Difference, paired_difference, performance_profile, shifted_geometric_mean
 from problems.bench.rows import Row
 from problems.bench.scenario import NO_SOLVER
+from problems.bench.settings import as_text
 
 UNSOLVED_SHARE = 0.01  # a trial counts as failed when more of its steps ended neither solved nor infeasible
 SHIFT = 1e-3  # seconds; solve times of a trial far below it count as equal
@@ -27,8 +29,34 @@ def solve_time(row: Row) -> float | None:
 
 
 @dataclass(frozen=True)
+class Contest:
+    """Problems that the same solvers were given.
+
+    Attributes:
+        label: which problems, in words.
+        times: solve times by solver, of the same instances in the same order; None is a failure. An instance is a trial
+            of a method with its settings.
+    """
+
+    label: str
+    times: dict[str, list[float | None]]
+
+    def means(self, limit: float) -> list[SolverTime]:
+        """Shifted geometric means by solver, failures at `limit` seconds, fastest first."""
+        found = [
+            SolverTime(solver, len(values), values.count(None), shifted_geometric_mean(values, SHIFT, limit))
+            for solver, values in self.times.items()
+        ]
+        return sorted(found, key=lambda item: item.geometric_mean)
+
+    def profile(self) -> dict[str, Any]:
+        """Performance profile by solver (`problems.bench.metrics.performance_profile`)."""
+        return performance_profile(self.times)
+
+
+@dataclass(frozen=True)
 class SolverTime:
-    """Solve times of one solver over all trials of a scenario."""
+    """Solve times of one solver over the instances of a contest."""
 
     solver: str
     trials: int
@@ -36,31 +64,93 @@ class SolverTime:
     geometric_mean: float
 
 
-def solver_times(rows: Sequence[Row], limit: float) -> list[SolverTime]:
-    """Shifted geometric mean of the solve times by solver, failures at `limit` seconds, fastest first."""
-    times: dict[str, list[float | None]] = {}
+def contests(rows: Sequence[Row]) -> list[Contest]:
+    """Who can be compared with whom: methods and settings that the same two or more solvers ran stand together.
+
+    A pairing that does not exist is left out, so a solver is never blamed for a problem it cannot be given.
+
+    Args:
+        rows: of one scenario.
+    """
+    configurations: dict[tuple[str, str], dict[str, dict[tuple[int, int], float | None]]] = {}
     for row in rows:
-        if row.job.solver != NO_SOLVER:
-            times.setdefault(row.job.solver, []).append(solve_time(row))
-    found = [
-        SolverTime(solver, len(values), values.count(None), shifted_geometric_mean(values, SHIFT, limit))
-        for solver, values in times.items()
-    ]
-    return sorted(found, key=lambda item: item.geometric_mean)
+        if row.job.solver != NO_SOLVER and not row.impossible:
+            problem = row.job.method, json.dumps(row.job.settings, sort_keys=True)
+            trials = configurations.setdefault(problem, {}).setdefault(row.job.solver, {})
+            trials[row.job.seed, row.job.trial] = solve_time(row)
+    groups: dict[frozenset[str], list[tuple[str, str]]] = {}
+    for problem, by_solver in configurations.items():
+        if len(by_solver) > 1:
+            groups.setdefault(frozenset(by_solver), []).append(problem)
+    found = []
+    for members in groups.values():
+        times: dict[str, list[float | None]] = {solver: [] for solver in configurations[members[0]]}
+        for problem in members:
+            by_solver = configurations[problem]
+            shared = [trial for trial in next(iter(by_solver.values())) if all(trial in t for t in by_solver.values())]
+            for solver, values in times.items():
+                values += [by_solver[solver][trial] for trial in shared]
+        if all(times.values()):
+            found.append(Contest(_named(members, list(configurations)), times))
+    return found
 
 
-def solver_profile(rows: Sequence[Row]) -> dict[str, Any]:
-    """Performance profile over solvers; an instance is a trial of a method with its settings that all solvers ran."""
-    by_instance: dict[tuple[Any, ...], dict[str, float | None]] = {}
+def _named(members: Sequence[tuple[str, str]], everything: Sequence[tuple[str, str]]) -> str:
+    """Methods of the members, and the settings in which they differ from other problems."""
+    label = ", ".join(dict.fromkeys(method for method, _ in members))
+    all_settings = [json.loads(settings) for _, settings in everything]
+    own_settings = [json.loads(settings) for _, settings in members]
+    for key in all_settings[0]:
+        values = list(dict.fromkeys(as_text(settings.get(key)) for settings in all_settings))
+        own = list(dict.fromkeys(as_text(settings.get(key)) for settings in own_settings))
+        if len(own) < len(values):
+            label += f"; {key} {', '.join(own)}"
+    return label
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """How one method and solver came through all its settings and trials.
+
+    Attributes:
+        method, solver: who.
+        trials, failed, impossible: numbers of trials, as in `problems.bench.summary.Summary`.
+        status: steps by status name.
+        infeasible_handled: share of the infeasible steps after which the trial went on to its end; None without any.
+    """
+
+    method: str
+    solver: str
+    trials: int
+    failed: int
+    impossible: int
+    status: dict[str, int]
+    infeasible_handled: float | None
+
+
+def robustness(rows: Sequence[Row]) -> list[Robustness]:
+    """One entry for each method and solver, in the order of their first rows."""
+    groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        if row.job.solver != NO_SOLVER:
-            instance = (row.job.method, json.dumps(row.job.settings, sort_keys=True), row.job.seed, row.job.trial)
-            by_instance.setdefault(instance, {})[row.job.solver] = solve_time(row)
-    solvers = list(dict.fromkeys(solver for times in by_instance.values() for solver in times))
-    shared = [times for times in by_instance.values() if len(times) == len(solvers)]
-    if len(solvers) < 2 or not shared:
-        return {}
-    return performance_profile({solver: [times[solver] for times in shared] for solver in solvers})
+        groups.setdefault((row.job.method, row.job.solver), []).append(row)
+    found = []
+    for (method, solver), group in groups.items():
+        status: Counter[str] = Counter()
+        for row in group:
+            status.update(row.status)
+        handled = sum(row.status.get("infeasible", 0) for row in group if row.failure is None)
+        found.append(
+            Robustness(
+                method=method,
+                solver=solver,
+                trials=len(group),
+                failed=sum(row.failure is not None and not row.impossible for row in group),
+                impossible=sum(row.impossible for row in group),
+                status=dict(status),
+                infeasible_handled=handled / status["infeasible"] if status["infeasible"] else None,
+            )
+        )
+    return found
 
 
 @dataclass(frozen=True)
@@ -107,6 +197,69 @@ def solver_differences(rows: Sequence[Row], metric: str) -> list[Comparison]:
         if solver not in (NO_SOLVER, *solvers[:1]) and reference:
             found += _comparison(solver, solvers[0], method, settings, by_trial, reference)
     return found
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What one value of a setting changes, everything else equal.
+
+    Attributes:
+        setting, value, baseline: its name, the value, and what that is compared with.
+        method, solver, settings: what both have in common; `settings` has no `setting`.
+        metric, time, iterations: differences trial by trial of the metric, the solve time (s) and the iterations; None
+            with fewer than two pairs.
+    """
+
+    setting: str
+    value: Any
+    baseline: Any
+    method: str
+    solver: str
+    settings: dict[str, Any]
+    metric: Difference | None
+    time: Difference | None
+    iterations: Difference | None
+
+
+def setting_differences(rows: Sequence[Row], metric: str, settings: Sequence[str]) -> list[Effect]:
+    """Differences of each value of the `settings` to the first one that was run.
+
+    Args:
+        rows: of one scenario.
+        metric: by name.
+        settings: names of those to look at.
+    """
+    found = []
+    for setting in settings:
+        groups: dict[tuple[str, str, str], dict[str, list[Row]]] = {}
+        for row in rows:
+            if setting in row.job.settings:
+                others = {key: value for key, value in row.job.settings.items() if key != setting}
+                group = groups.setdefault((row.job.method, row.job.solver, json.dumps(others, sort_keys=True)), {})
+                group.setdefault(json.dumps(row.job.settings[setting]), []).append(row)
+        for (method, solver, others), by_value in groups.items():
+            baseline, *compared = by_value
+            for value in compared:
+                pairs = _pairs(by_value[value], by_value[baseline])
+                quantities: list[list[tuple[float | None, float | None]]] = [
+                    [(a.metrics.get(metric), b.metrics.get(metric)) for a, b in pairs],
+                    [(solve_time(a), solve_time(b)) for a, b in pairs],
+                    [(_iterations(a), _iterations(b)) for a, b in pairs],
+                ]
+                effects = [paired_difference([a for a, _ in each], [b for _, b in each]) for each in quantities]
+                if any(effects):
+                    ends = json.loads(value), json.loads(baseline)
+                    found.append(Effect(setting, *ends, method, solver, json.loads(others), *effects))
+    return found
+
+
+def _pairs(rows: Sequence[Row], baseline: Sequence[Row]) -> list[tuple[Row, Row]]:
+    by_trial = {(row.job.seed, row.job.trial): row for row in baseline}
+    return [(row, by_trial[trial]) for row in rows if (trial := (row.job.seed, row.job.trial)) in by_trial]
+
+
+def _iterations(row: Row) -> float | None:
+    return None if row.failure else float(row.iterations)
 
 
 _Trials = dict[tuple[int, int], float | None]

@@ -98,7 +98,8 @@ def as_markdown(summaries: Sequence[Summary], scenarios: Facts) -> str:
             cells = [row.method, row.solver, *(as_text(row.settings.get(key)) for key in settings)]
             cells += [number(row.metrics.get(key), row.metrics_se.get(key)) for key in metrics]
             cells += [seconds(row.time["step_median"]), seconds(row.time["solve"]), percent(solved_share(row.status))]
-            cells += [f"{row.failed}/{row.trials}", f"`{command(row, scenarios)}`"]
+            failed = "impossible" if row.impossible else f"{row.failed}/{row.trials}"
+            cells += [failed, f"`{command(row, scenarios)}`"]
             lines.append(_line(cells))
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
@@ -112,17 +113,28 @@ def as_csv(summaries: Sequence[Summary], scenarios: Facts) -> str:
     statuses = list(summaries[0].status) if summaries else []
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    head = ["scenario", "method", "solver", "seed", "trials", "failed", *(f"setting.{key}" for key in settings)]
+    head = [
+        "scenario",
+        "method",
+        "solver",
+        "seed",
+        "trials",
+        "failed",
+        "impossible",
+        *(f"setting.{key}" for key in settings),
+    ]
     for key in metrics:
         head += [f"metric.{key}", f"metric_se.{key}"]
-    head += [f"time.{key}" for key in times] + ["cpu", "memory", "iterations", "residual"]
+    head += [f"time.{key}" for key in times] + ["step_max", "wall", "cpu", "memory", "iterations", "residual"]
     writer.writerow([*head, *(f"status.{key}" for key in statuses), "reproduce"])
     for row in summaries:
         cells: list[Any] = [row.scenario, row.method, row.solver, row.seed, row.trials, row.failed]
+        cells.append(row.impossible)
         cells += [as_text(row.settings[key]) if key in row.settings else None for key in settings]
         for key in metrics:
             cells += [row.metrics.get(key), row.metrics_se.get(key)]
-        cells += [row.time[key] for key in times] + [row.cpu, row.memory, row.iterations, row.residual]
+        cells += [row.time[key] for key in times] + [row.step_max, row.wall, row.cpu, row.memory]
+        cells += [row.iterations, row.residual]
         writer.writerow([*cells, *row.status.values(), command(row, scenarios)])
     return buffer.getvalue()
 

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 from problems import registry
-from problems.bench.rows import Failure, Job, Row, finite
 from problems.bench.metrics import chi_square_interval
+from problems.bench.rows import Failure, Job, Row, finite
 from problems.bench.scenario import DISTANCE, TIMES, Consistency, Curve, Outcome, Scenario, trial_rng
 from problems.bench.settings import validated
 from problems.errors import ShapeError
-
 
 POINTS = 64  # of a curve that are kept
 DIGITS = 6  # of each

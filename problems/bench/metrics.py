@@ -99,8 +99,8 @@ def paired_difference(
 def chi_square_interval(degrees: float, confidence: float = 0.95) -> tuple[float, float]:
     """The interval that holds a chi-square variable with this probability, equal tails outside.
 
-    The mean of a squared normalized error with d degrees of freedom over m independent trials lies, where the covariance
-    is right, in ``chi_square_interval(m * d)`` divided by m.
+    Where the covariance is right, the mean of a squared normalized error with d degrees of freedom over m independent
+    trials lies in ``chi_square_interval(m * d)`` divided by m.
     """
     from scipy.special import chdtri
 

@@ -1,8 +1,8 @@
 """Rows as a Parquet table: one table row a job, the sessions in the metadata of the schema.
 
 Dictionaries of numbers are spread over dotted columns (`metrics.rmse`, `times.solve`, `status.solved`); settings,
-options, warnings, curves and consistency, whose types or keys differ from scenario to scenario, are JSON text. In `metrics.*` null means that the
-row has no such metric and NaN that the metric has no value.
+options, warnings, curves and consistency, whose keys or types differ from scenario to scenario, are JSON text. In
+`metrics.*` null means that the row has no such metric and NaN that the metric has no value.
 """
 
 from __future__ import annotations

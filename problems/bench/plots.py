@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from problems.bench.summary import Summary
+from problems.bench.curves import Band, Claim
+from problems.bench.scenario import DISTANCE
+from problems.bench.summary import TRADE_OFFS, Summary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +22,8 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 SHAPES = "osD^vP*X<>ph"
 LINES = ("-", "--", "-.", ":")
-TRADE_OFFS = ("tolerance", "iteration_limit")  # settings that trade accuracy for time: their points are joined
+ROUNDING = 1e-16  # distances of answers below it are drawn at it: nobody computes them better
+Axis = Literal["time", "iterations"]
 
 
 def _styles(labels: Sequence[str]) -> dict[str, Any]:
@@ -40,68 +44,126 @@ def time_of(summary: Summary) -> tuple[float | None, str]:
     return (step, "median time of a step") if step is not None else (summary.time["solve"], "solve time of a trial")
 
 
-def accuracy_against_time(summaries: Sequence[Summary], metric: str, prefix: str) -> Figure:
-    """The metric (mean ± standard error) against time, points of one method and solver joined along the tolerance.
+@dataclass(frozen=True, eq=False)
+class Marked:
+    """A figure whose SVG groups can be found again.
+
+    Attributes:
+        figure: artists that belong to a label have the gid ``{prefix}-{part}-{number}``.
+        groups: the summaries behind the points of each number, in the order they are drawn.
+    """
+
+    figure: Figure
+    groups: list[list[Summary]]
+
+
+def accuracy_against(summaries: Sequence[Summary], metric: str, prefix: str, axis: Axis = "time") -> Marked:
+    """The metric (mean ± standard error) against what it costs, points of one method and solver joined by tolerance.
 
     Args:
         summaries: of one scenario.
-        metric: vertical axis.
-        prefix: each point is an SVG group with the id ``{prefix}-point-{index in summaries}``, each line one with
-            ``{prefix}-line-{index of its first point}``.
+        metric: vertical axis; smaller is better where a front is drawn.
+        prefix: of the groups; their parts are ``points`` (one marker each), ``bars`` and ``line``.
+        axis: "time" of a step, or "iterations" of a trial.
     """
     figure, axes = _figure()
-    shown = [
-        (number, summary, seconds, value)
-        for number, summary in enumerate(summaries)
-        if (seconds := time_of(summary)[0]) and (value := summary.metrics.get(metric)) is not None
-    ]
-    styles = _styles(list(dict.fromkeys(summary.label for _, summary, _, _ in shown)))
-    lines: dict[tuple[str, str], list[tuple[int, float, float]]] = {}
-    for number, summary, seconds, value in shown:
-        style = styles[summary.label]
-        point = axes.errorbar(
-            [seconds],
-            [value],
-            yerr=[summary.metrics_se.get(metric) or 0.0],
-            color=style["color"],
-            linewidth=1,
-            capsize=2,
-        )
-        for part in point.get_children():
-            part.set_gid(f"{prefix}-point-{number}")
-        marker = axes.plot([seconds], [value], **style | {"linestyle": "none"}, markersize=8, zorder=3)
-        marker[0].set_gid(f"{prefix}-point-{number}")
-        others = {key: setting for key, setting in summary.settings.items() if key not in TRADE_OFFS}
-        lines.setdefault((summary.label, json.dumps(others, sort_keys=True)), []).append((number, seconds, value))
-    for (label, _), points in lines.items():
-        line = axes.plot(
-            *zip(*[point[1:] for point in points], strict=True), **styles[label] | {"marker": ""}, alpha=0.6
-        )
-        line[0].set_gid(f"{prefix}-line-{points[0][0]}")
+    shown = [each for each in summaries if _cost(each, axis) and each.metrics.get(metric) is not None]
+    styles = _styles(list(dict.fromkeys(summary.label for summary in shown)))
+    groups = []
+    for number, (label, style) in enumerate(styles.items()):
+        own = [summary for summary in shown if summary.label == label]
+        x, y, errors = np.array([(_cost(s, axis), s.metrics[metric], s.metrics_se.get(metric) or 0.0) for s in own]).T
+        y = np.maximum(y, ROUNDING) if metric == DISTANCE else y
+        if errors.any():
+            bars = axes.errorbar(x, y, yerr=errors, fmt="none", color=style["color"], linewidth=1)
+            for part in bars.get_children():
+                part.set_gid(f"{prefix}-bars-{number}")
+        joined = _joined(own, x, y)
+        if joined.size:
+            line = axes.plot(*joined.T, **style | {"marker": ""}, alpha=0.6)
+            line[0].set_gid(f"{prefix}-line-{number}")
+        points = axes.plot(x, y, **style | {"linestyle": "none"}, markersize=8, zorder=3)
+        points[0].set_gid(f"{prefix}-points-{number}")
+        groups.append(own)
     axes.set_xscale("log")
-    _scale_of_values(axes, [value for _, _, _, value in shown])
-    axes.set_xlabel(" / ".join(dict.fromkeys(time_of(summary)[1] for _, summary, _, _ in shown)) + " in s")
+    floor = ROUNDING if metric == DISTANCE else -np.inf
+    _scale_of_values(axes, [max(summary.metrics[metric] or 0.0, floor) for summary in shown])
+    names = dict.fromkeys(time_of(summary)[1] for summary in shown)
+    axes.set_xlabel(" / ".join(names) + " in s" if axis == "time" else "solver iterations of a trial")
     axes.set_ylabel(metric)
     _legend(figure, styles)
-    return figure
+    return Marked(figure, groups)
 
 
-def profile(profiles: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """Performance profile: share of the instances a solver finishes within a factor of the fastest."""
+def _cost(summary: Summary, axis: Axis) -> float | None:
+    return time_of(summary)[0] if axis == "time" else summary.iterations
+
+
+def _joined(summaries: Sequence[Summary], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Corners (k, 2) of the lines through points that differ in tolerance or limit only, NaN between two lines."""
+    lines: dict[str, list[int]] = {}
+    for number, summary in enumerate(summaries):
+        others = {key: value for key, value in summary.settings.items() if key not in TRADE_OFFS}
+        lines.setdefault(json.dumps([others, summary.seed], sort_keys=True), []).append(number)
+    corners = [np.r_[np.c_[x[line], y[line]], [[np.nan, np.nan]]] for line in lines.values() if len(line) > 1]
+    return np.concatenate(corners) if corners else np.empty((0, 2))
+
+
+def bands(curves: Sequence[tuple[str, Band]], name: str, prefix: str, claim: Sequence[Claim] = ()) -> Marked:
+    """Means of curves over the trials, with the percentiles of `problems.bench.curves.OUTER` around them.
+
+    Args:
+        curves: with their labels.
+        name: vertical axis.
+        prefix: of the groups, whose parts are ``band``, ``line`` and ``points``.
+        claim: of each curve when the curves are squared normalized errors: they are drawn per degree of freedom, and
+            instead of bands the interval they should lie in.
+    """
+    figure, axes = _figure()
+    styles = _styles([label for label, _ in curves])
+    for number, (label, band) in enumerate(curves):
+        style, scale = styles[label], 1.0 / claim[number].degrees if claim else 1.0
+        if not claim and band.trials > 1:
+            around = axes.fill_between(band.at, band.lower, band.upper, color=style["color"], alpha=0.13, linewidth=0)
+            around.set_gid(f"{prefix}-band-{number}")
+        # few markers tell lines apart; they start at different places so that they do not cover each other
+        every = max(1, band.at.size // 7)
+        marks = {"markevery": (number * 2 % every, every), "markersize": 6}
+        line = axes.plot(band.at, band.mean * scale, **style | marks, linewidth=1.6)
+        line[0].set_gid(f"{prefix}-line-{number}")
+    for lower, upper in dict.fromkeys((item.lower, item.upper) for item in claim):
+        axes.axhspan(lower, upper, color="#666666", alpha=0.15, linewidth=0, zorder=0)
+    if claim:
+        axes.axhline(1.0, color="#333333", linewidth=1)
+    _scale_of_values(axes, np.concatenate([band.mean for _, band in curves]).tolist())
+    axes.set_xlabel(" / ".join(dict.fromkeys(band.over for _, band in curves)))
+    axes.set_ylabel(f"{name} / degrees of freedom" if claim else name)
+    _legend(figure, {label: style | {"linewidth": 1.6} for label, style in styles.items()})
+    return Marked(figure, [[band.summary] for _, band in curves])
+
+
+def profile(profiles: Mapping[str, tuple[np.ndarray, np.ndarray]], prefix: str) -> Figure:
+    """Performance profile: share of the instances a solver finishes within a factor of the fastest.
+
+    Args:
+        profiles: by solver.
+        prefix: the line of a solver is the SVG group ``{prefix}-line-{number}``.
+    """
     figure, axes = _figure()
     styles = _styles(list(profiles))
     widest = max((float(factors[-1]) for factors, _ in profiles.values() if factors.size), default=1.0)
-    for label, (factors, shares) in profiles.items():
+    for number, (label, (factors, shares)) in enumerate(profiles.items()):
         factors, shares = np.r_[factors, widest * 1.1], np.r_[shares, shares[-1:] if shares.size else [0.0]]
         if factors[0] > 1:
             factors, shares = np.r_[1.0, factors], np.r_[0.0, shares]
-        style = {key: styles[label][key] for key in ("color", "linestyle")}
-        axes.step(factors, shares, where="post", label=label, linewidth=2, **style)
+        marks = {"markevery": max(1, factors.size // 6), "markersize": 6}
+        line = axes.step(factors, shares, where="post", linewidth=1.8, **styles[label] | marks)
+        line[0].set_gid(f"{prefix}-line-{number}")
     axes.set_xscale("log")
     axes.set_ylim(0, 1.02)
     axes.set_xlabel("time as a multiple of the fastest solver's")
     axes.set_ylabel("share of trials")
-    _legend(figure, {label: style | {"marker": ""} for label, style in styles.items()})
+    _legend(figure, styles)
     return figure
 
 

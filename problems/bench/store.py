@@ -1,10 +1,10 @@
 """Where rows are kept: a journal that survives a kill, compacted to Parquet.
 
 The journal (`journal.jsonl`) holds one JSON object a line, a `session` for each time the benchmark was started in the
-folder and a `row` for each finished job. A row is handed to the operating system before the next one is looked at, so no finished
-row is lost with the process, however it dies; a thread asks for the disk every `SYNC_SECONDS`, so a power failure costs
-the rows of that time at most and the campaign never waits for the disk. `rows.parquet` is made from the journal and holds
-the same (`problems.bench.parquet`).
+folder and a `row` for each finished job. A row is handed to the operating system before the next one is looked at, so
+no finished row is lost with the process, however it dies. A thread syncs the disk every `SYNC_SECONDS`, so a power
+failure costs the rows of that time at most, and the campaign never waits for the disk. `rows.parquet` is made from the
+journal and holds the same (`problems.bench.parquet`).
 """
 
 from __future__ import annotations

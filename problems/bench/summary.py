@@ -17,6 +17,9 @@ from problems.bench.settings import as_text
 from problems.solvers.base import Status
 
 STEP_TIMES = ("step_median", "step_p95")
+TRADE_OFFS = ("tolerance", "iteration_limit")  # settings that trade accuracy for time
+
+Configuration = tuple[str, str, str, str, int]
 
 
 @dataclass(frozen=True)
@@ -61,22 +64,32 @@ class Summary:
     residual: float | None
 
     @property
+    def configuration(self) -> Configuration:
+        """As `configuration` of each of its jobs."""
+        return configuration(Job(self.scenario, self.method, self.solver, self.settings, self.seed, 0))
+
+    @property
     def label(self) -> str:
         """Method and solver."""
         return self.method if self.solver == NO_SOLVER else f"{self.method} · {self.solver}"
 
 
-def configuration(job: Job) -> tuple[str, str, str, str, int]:
+def configuration(job: Job) -> Configuration:
     """What the trials of one summary have in common."""
     return job.scenario, job.method, job.solver, json.dumps(job.settings, sort_keys=True), job.seed
 
 
 def summarize(rows: Iterable[Row]) -> list[Summary]:
     """One summary for each configuration, in the order of their first rows."""
-    groups: dict[tuple[str, str, str, str, int], list[Row]] = {}
+    return [_summary(group) for group in by_configuration(rows).values()]
+
+
+def by_configuration(rows: Iterable[Row]) -> dict[Configuration, list[Row]]:
+    """Rows by configuration, in the order of their first rows."""
+    groups: dict[Configuration, list[Row]] = {}
     for row in rows:
         groups.setdefault(configuration(row.job), []).append(row)
-    return [_summary(group) for group in groups.values()]
+    return groups
 
 
 def _summary(rows: Sequence[Row]) -> Summary:

@@ -95,7 +95,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
                 *(number(row.metrics.get(key), row.metrics_se.get(key)) for key in metrics),
                 *(seconds(row.time[key]) for key in (*STEP_TIMES, *TIMES)),
                 percent(solved_share(row.status)),
-                str(row.failed),
+                "impossible" if row.impossible else str(row.failed),
             )
         console().print(made)
 
@@ -107,23 +107,38 @@ def _counted(rows: Sequence[Summary]) -> str:
     return f"{trials}, seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
 
 
-def print_failures(rows: Iterable[Row], defaults: Callable[[Job], dict[str, Any]]) -> int:
-    """Say on standard error what failed and how to see it again.
+def print_failures(rows: Sequence[Row], defaults: Callable[[Job], dict[str, Any]]) -> int:
+    """Say on standard error what failed and how to see it again, and which pairings do not exist.
 
     Args:
         rows: all rows.
         defaults: default settings of the scenario of a job.
 
     Returns:
-        The exit code of the command: 0 without failures, 2 when an input could not be read, else 1.
+        The exit code of the command: 2 when an input could not be read, 1 when a trial failed or nothing could run at
+        all, else 0. A method that cannot go to a solver is no failure as long as others can.
     """
-    failed = [row for row in rows if row.failure is not None]
-    different = {(configuration(row.job), row.failure.message): row for row in reversed(failed) if row.failure}
+    failed = [row for row in rows if row.failure is not None and not row.impossible]
+    impossible = [row for row in rows if row.impossible]
+    _print(failed, lambda job, message: (configuration(job), message), "failed", "red", defaults)
+    _print(impossible, lambda job, _: (job.scenario, job.method, job.solver), "not possible", "yellow", defaults)
+    if rows and len(impossible) == len(rows):
+        return 1
+    return max((2 if row.failure.kind == ReadError.__name__ else 1 for row in failed if row.failure), default=0)
+
+
+def _print(
+    rows: Sequence[Row],
+    alike: Callable[[Job, str], Any],
+    what: str,
+    style: str,
+    defaults: Callable[[Job], dict[str, Any]],
+) -> None:
+    different = {alike(row.job, row.failure.message): row for row in reversed(rows) if row.failure}
     out = error_console()
     for row in list(different.values())[::-1][:FAILURES_SHOWN]:
         assert row.failure is not None
-        out.print(f"failed: {row.failure.kind}: {row.failure.message}", style="red", soft_wrap=True)
+        out.print(f"{what}: {row.failure.kind}: {row.failure.message}", style=style, soft_wrap=True)
         out.print(f"  {reproduce(row.job, defaults(row.job))}", soft_wrap=True)
     if len(different) > FAILURES_SHOWN:
-        out.print(f"  and {len(different) - FAILURES_SHOWN} different failures more")
-    return max((2 if row.failure.kind == ReadError.__name__ else 1 for row in failed if row.failure), default=0)
+        out.print(f"  and {len(different) - FAILURES_SHOWN} others that were {what}")
