@@ -7,7 +7,12 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import numpy as np
 import pydantic
+
+from mhe.distributed.options import NetworkGrowthPrior
+from mhe.sporadic.options import DetectionPrior, DetectionUpdate, Disturbance, InfeasibleRows, ObserverData, RowScope
+from problems.networks import FusionRule
 
 Case = Literal[1, 2, 3, "gazebo"]
 PerCamera = float | tuple[float, ...]
@@ -43,10 +48,8 @@ CASES: dict[Any, dict[str, Any]] = {
 }
 
 
-class Settings(pydantic.BaseModel):
+class Settings(pydantic.BaseModel, extra="forbid", frozen=True):
     """Settings of the scenario; the defaults are those of case 1, another case brings its own."""
-
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
 
     case: Case = pydantic.Field(1, description="1: 12 cameras, 2: 6, 3: 12 that see half the road; gazebo: 17")
     radius: int = pydantic.Field(1, ge=0, description="rho: cameras hear those whose number differs by no more")
@@ -86,6 +89,28 @@ class Settings(pydantic.BaseModel):
     initial: tuple[float, float] = pydantic.Field((0.0, 0.0), description="first estimate of all vehicles (m)")
     prior_variance: float = pydantic.Field(1e5, gt=0, description="Pi_0 / I (m^2)")
 
+    disturbance: Disturbance | None = pydantic.Field(
+        None, description="observer or process_noise for all methods; null: each method's own, as with the next ones"
+    )
+    observer: ObserverData = pydantic.Field("local", description="readings that observers are fed, local or regional")
+    weights: Literal["rank", "uniform", "metropolis"] | None = pydantic.Field(None, description="consensus weights")
+    weight_fusion: FusionRule | None = pydantic.Field(None, description="convex is (4.11), out_degree is (2.23)")
+    pi_update: DetectionUpdate | None = pydantic.Field(None, description="arrival covariance, section 3.8")
+    prior: DetectionPrior | None = pydantic.Field(None, description="arrival cost")
+    growth_prior: NetworkGrowthPrior | None = pydantic.Field(None, description="reference while the window fills")
+    rows: Literal["hard", "soft", "projected"] = pydantic.Field(
+        "hard", description="of the methods with rows; projected concerns those with an observer, the others have hard"
+    )
+    row_scope: RowScope | None = pydantic.Field(None, description="detections that make rows, own or regional")
+    unmet: InfeasibleRows | None = pydantic.Field(None, description="where hard rows contradict each other")
+    tolerance: float = pydantic.Field(1e-8, gt=0, description="of the solver")
+
+    score_from: float = pydantic.Field(0.0, ge=0, description="metrics count from here (s)")
+    score_until: float | None = pydantic.Field(None, gt=0, description="and up to here (s)")
+    instants: tuple[float, ...] | None = pydantic.Field(
+        None, min_length=1, max_length=6, description="when the picture shows the scene (s)"
+    )
+
     replay: str | None = pydantic.Field(
         None, description="CSV of readings instead of drawn ones: time,sensor,vehicle,x,y"
     )
@@ -109,6 +134,8 @@ class Settings(pydantic.BaseModel):
                 )
             if name != "sideways" and values is not None and min(_all(values)) <= 0:
                 raise ValueError(f"{name} must be positive, got {min(_all(values)):g} m")
+        if self.score_from >= min(self.duration, np.inf if self.score_until is None else self.score_until):
+            raise ValueError(f"score_from={self.score_from:g} leaves no instant to score")
         if self.replay_truth is not None and self.replay is None:
             raise ValueError("replay_truth belongs to replay=PATH")
         return self
