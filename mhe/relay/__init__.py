@@ -7,6 +7,7 @@ from mhe.relay.options import RELAY_METHODS, RelayOptions, relay_options_of
 from mhe.relay.report import RelayReport
 from mhe.relay.rule import held, reach
 from mhe.relay.schedule import RelaySchedule
+from mhe.relay.windows import RelayWindows
 
 __all__ = [
     "RELAY_METHODS",
@@ -17,6 +18,7 @@ __all__ = [
     "RelayOptions",
     "RelayReport",
     "RelaySchedule",
+    "RelayWindows",
     "held",
     "reach",
     "relay_options_of",

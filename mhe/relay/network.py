@@ -33,6 +33,7 @@ class RelayEstimator(DistributedEstimator):
         rng: seeds loss and delay.
         processes: run every node in its own process; same results.
         record: keep a `Trace`.
+        windows: compiled windows to share with other estimators.
 
     Attributes:
         design: what was settled before the run.
@@ -56,11 +57,12 @@ class RelayEstimator(DistributedEstimator):
         rng: np.random.Generator | None = None,
         processes: bool = False,
         record: bool = False,
+        windows: RelayWindows | None = None,
         **design: Any,
     ) -> None:
         self.design = RelayDesign(model, network, method, **design)
         self.model, self.options = self.design.model, self.design.options
-        self.windows = RelayWindows()
+        self.windows = RelayWindows() if windows is None else windows
         self._plans = tuple(plan_of(self.design, node) for node in range(network.count))
         self._transport = {"links": links, "outages": tuple(outages), "processes": processes, "record": record}
         self._rng = rng
