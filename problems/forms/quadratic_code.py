@@ -7,7 +7,7 @@ eliminated unknowns replaced, so its zeros stay unwritten: a new pattern costs a
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
@@ -71,14 +71,15 @@ class QuadraticCode:
         self._pieces, self._index, self._ends = self._packed([P.T, q.T, A.T, shift.T, Z.T, offset.T])
         self._compile()
         rows = [_Instances(entry, template_of(entry.term).dim) for entry in self._bounded]
-        self._limits = [Bounds.of(layout, rows, key) for key in ("lower", "upper")]  # type: ignore[arg-type]
+        self._limits = [_Limit(Bounds.of(layout, cast(Any, rows), key)) for key in ("lower", "upper")]
+        self._has_cost_switch = any(entry.term.active is not None for entry in self._costs)
         self._row_flags = np.concatenate([np.zeros(0, np.intp), *self._switches(rows)])
 
     def _compile(self) -> None:
         self._function = ca.Function("assemble", [self._d, self._on], [self._pieces])
         self._values = np.empty(self._pieces.shape[0])
         self._buffer, self._run = self._function.buffer()
-        self._buffer.set_res(0, memoryview(self._values))
+        self._buffer.set_res(0, self._values.data)
 
     def _switches(self, rows: list[_Instances]) -> list[np.ndarray]:
         """Position of the flag of every inequality row, -1 where it has none."""
@@ -122,8 +123,8 @@ class QuadraticCode:
             )
         elif self._row_flags.size:
             off = (numbers[self._row_flags] == 0) & (self._row_flags >= 0)
-        self._buffer.set_arg(0, memoryview(numbers))
-        self._buffer.set_arg(1, memoryview(on))
+        self._buffer.set_arg(0, numbers.data)
+        self._buffer.set_arg(1, on.data)
         self._run()
         flat = np.zeros(self._ends[-1])
         flat[self._index] = self._values
@@ -134,22 +135,19 @@ class QuadraticCode:
         l, u = self._bounds(numbers, shift[:, 0], off)
         return Assembled(P, q[:, 0], A, l, u, Z, offset[:, 0])
 
-    @property
-    def _has_cost_switch(self) -> bool:
-        return any(entry.term.active is not None for entry in self._costs)
-
     def _bounds(self, numbers: np.ndarray, shift: np.ndarray, off: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        l, u = np.zeros(shift.size), np.zeros(shift.size)
-        if shift.size > self.equalities:
-            lower, upper = l[self.equalities :], u[self.equalities :]
-            for into, limit in zip((lower, upper), self._limits, strict=True):
-                into[...] = limit(numbers)
-            lower[lower <= -INFINITE] = -np.inf
-            upper[upper >= INFINITE] = np.inf
-            if off is not None:
-                lower[off] = -np.inf
-                upper[off] = np.inf
-        return l - shift, u - shift
+        m = self.equalities
+        l, u = -shift, -shift
+        if shift.size > m:
+            for into, limit, infinite in ((l[m:], self._limits[0], -np.inf), (u[m:], self._limits[1], np.inf)):
+                into += limit.constant
+                if limit.places is not None:
+                    given = numbers[limit.places]
+                    given[np.abs(given) >= INFINITE] = infinite
+                    into[limit.rows] += given
+                if off is not None:
+                    into[off] = infinite
+        return l, u
 
     # Symbols
 
@@ -261,6 +259,16 @@ class QuadraticCode:
             dim = template_of(term).dim
             return [ca.repmat(self._d[i.tolist()], dim // len(i), 1) for i in entry.linear]
         return [ca.DM(row) for row in constant_rows(term.linear, template_of(term).dim, term.count, term.what)]
+
+
+class _Limit:
+    """One side of the bounds: constants, and for some rows a number of the data."""
+
+    def __init__(self, bounds: Bounds) -> None:
+        by_data = bounds.index >= 0
+        self.constant = np.where(by_data, 0.0, bounds.constant)
+        self.rows: Any = slice(None) if by_data.all() else by_data
+        self.places = bounds.index[by_data] if by_data.any() else None
 
 
 class _Instances:

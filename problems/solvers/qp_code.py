@@ -21,7 +21,7 @@ from problems.solvers.session import Solution
 class CodeSession(QPSession):
     """See `Session`; made by ``Problem.compile(..., assembly="code")``. Dense, for small problems.
 
-    Rows that are switched off do not reach the backend. It is built once for each number of rows and updated then.
+    Every solve starts cold: with all matrices new, the point before is no help.
     """
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
@@ -62,18 +62,16 @@ class CodeSession(QPSession):
         return v
 
     def _constrained(self, program: Assembled, numbers: np.ndarray, flags: Any) -> Solution:
-        used = (program.l > -np.inf) | (program.u < np.inf)
-        A, l, u = program.A[used], program.l[used], program.u[used]
-        result = self._backend_call(program.P, program.q, A, l, u)
-        status, result = judge(result, program.P, program.q, A, l, u, self.options.tolerance)
+        P, q, A, l, u, _, _ = program
+        result = self._answer(P, q, A, l, u)
+        status, result = judge(result, P, q, A, l, u, self.options.tolerance)
         iterations, message = result.iterations, result.message
         if result.x is None or result.y is None or not np.isfinite(result.x).all():
             point = self.layout.identity() if self._point is None else self._point
             check = self._check(numbers, flags, point, None)
             return Solution(self.layout, point, status, self.solver, check, iterations, message)
-        multipliers = np.zeros(used.size)
-        multipliers[used] = result.y
-        mu = multipliers[self.code.equalities :]
+        self.last = result.x, result.y
+        mu = result.y[self.code.equalities :]
         return self._solution(program, numbers, flags, result.x, mu, status, self.solver, iterations, message)
 
     def _solution(
@@ -96,11 +94,17 @@ class CodeSession(QPSession):
         kept = numbers.copy()
         return QPCheck(self.program, self.store, kept, Pattern(self.program, kept, flags), point, mu)
 
-    def _backend_call(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, l: np.ndarray, u: np.ndarray) -> QPResult:
+    def _answer(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, l: np.ndarray, u: np.ndarray) -> QPResult:
+        """What the backend says; rows that are off stay, without bounds, so that it keeps what it was built with."""
+        self.last = None
         try:
-            backend = self._backend_type(P, q, A, l, u, self.options)
-            return backend.solve(q, l, u)
+            if self._backend is None:
+                self._backend = self._backend_type(P, q, A, l, u, self.options)
+            else:
+                self._backend.update(P, A)
+            return self._backend.solve(q, l, u)
         except (SettingError, MissingExtraError):
             raise
-        except Exception as error:  # a backend that breaks is a status
+        except Exception as error:  # a backend that breaks is a status, and the next solve starts afresh
+            self._backend = None
             return QPResult(None, None, Status.FAILED, 0, f"{self.solver} raised {type(error).__name__}: {error}")
