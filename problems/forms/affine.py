@@ -130,11 +130,16 @@ class Rows:
 
 
 class AffineRows:
-    """The rows of all terms for given matrix data, as dense arrays or, for large problems, sparse ones."""
+    """The rows of all terms for given matrix data, as dense arrays or, for large problems, sparse ones.
+
+    Attributes:
+        parts: of every term its layout, the code of its coefficients, and the positions (count, numbers) of the matrix
+            data and of the vector data that its instances read.
+    """
 
     def __init__(self, layout: Layout, speeds: dict[str, Speed], dense: bool) -> None:
         self.layout, self.dense = layout, dense
-        self._parts = []
+        self.parts = []
         for entry in layout.terms:
             template = template_of(entry.term)
             matrix = tuple(speeds[slot.source.name] == "matrix" for slot in entry.term.data)
@@ -143,15 +148,15 @@ class AffineRows:
                 index = np.broadcast_to(layout.numbers(slot), (entry.term.count, slot.source.size))
                 (slow if is_matrix else fast).append(index)
             empty = [np.zeros((entry.term.count, 0), np.intp)]
-            self._parts.append(
+            self.parts.append(
                 (entry, _affine_code(template, matrix), np.hstack(slow or empty), np.hstack(fast or empty))
             )
-        self._constant: list[Rows | None] = [None] * len(self._parts)
+        self._constant: list[Rows | None] = [None] * len(self.parts)
 
     def evaluate(self, numbers: np.ndarray) -> list[Rows]:
         """Rows of every term, in the order of the problem. Raises DataError for an equality that is not finite."""
         out = []
-        for k, (entry, code, slow, fast) in enumerate(self._parts):
+        for k, (entry, code, slow, fast) in enumerate(self.parts):
             rows = self._constant[k]
             if rows is None:
                 J, E, c = code(numbers[slow], entry.term.count)

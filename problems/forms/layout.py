@@ -357,7 +357,7 @@ class Activity:
         return head + b"|" + numbers[self.switches].tobytes() if self.switches.size else head
 
     def flags(self, numbers: np.ndarray) -> list[np.ndarray | None]:
-        """For each term (count,) booleans, or None where all are on.
+        """For each term (..., count) booleans for numbers (..., data), or None where all are on.
 
         Raises:
             DataError: an equality reads missing data without their presence flags; a switch is NaN.
@@ -365,19 +365,19 @@ class Activity:
         out: list[np.ndarray | None] = []
         missing = np.isnan(numbers)
         for (entry, index, switch), constant in zip(self._terms, self.constant, strict=True):
-            on: Any = ~missing[index].any(axis=1)
+            on: Any = ~missing[..., index].any(axis=-1)
             if entry.term.kind == "equality":
                 if not on.all():
                     raise DataError(
-                        f"{entry.term.what}: instance {int(np.flatnonzero(~on)[0])} reads missing data; let it read "
+                        f"{entry.term.what}: instance {int(np.argwhere(~on)[0, -1])} reads missing data; let it read "
                         "presence(data) too and say what holds without them"
                     )
                 out.append(None)
                 continue
             if switch is not None:
-                if np.isnan(numbers[switch]).any():
+                if np.isnan(numbers[..., switch]).any():
                     raise DataError(f"{entry.term.what}: its active flags contain a NaN; use 1 and 0")
-                on &= numbers[switch] != 0
+                on &= numbers[..., switch] != 0
             if constant is not None:
                 on &= constant
             out.append(None if on.all() else on)

@@ -1,8 +1,9 @@
 """The same session on a leading axis: many nodes or many trials at once.
 
-On the quadratic form, entries with equal weights, matrices and pattern of missing data share one affine map and are
-answered by one matrix product; only entries that violate a row go to the QP backend, one by one. Other forms run one
-fork per entry behind the same interface.
+On the quadratic form, entries with equal weights, matrices and pattern of missing data share one affine map. The maps
+of all entries are worked out and applied on stacked arrays, entries that violate a row are solved together by a dual
+active-set method, and only what that leaves goes to the QP backend, one by one. Other forms run one fork per entry
+behind the same interface.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from problems.errors import DataError, ShapeError, UnknownNameError
 from problems.forms.layout import DataStore, Layout, data_rows
 from problems.forms.quadratic import clean
 from problems.solvers.base import Status
+from problems.solvers.qp_dual import nearest_points
 from problems.solvers.qp_maps import DenseMap, SparseMap
+from problems.solvers.qp_stacked import StackedMaps, StackedProgram
 from problems.solvers.session import Session, Solution
 
 if TYPE_CHECKING:
@@ -34,7 +37,7 @@ class BatchSolution:
         point: (entries, all stored coordinates).
         status, method, iterations: one per entry (object, object and int arrays).
         messages: by entry, where there is something to say.
-        seconds: ``{"solve"}`` of the whole batch.
+        seconds: of the whole batch: ``update`` for new weights, matrices and patterns, ``solve`` for the rest.
     """
 
     def __init__(self, layout: Layout, point: np.ndarray, method: str) -> None:
@@ -71,7 +74,14 @@ class BatchSession(ABC):
 
     Raises:
         ShapeError, UnknownNameError, DataError: as for `Session`, with the name of the data.
+
+    Attributes:
+        factorizations: matrices factorized so far to answer without active rows.
+        update_seconds: spent on weights, matrices and patterns since the last solve.
     """
+
+    factorizations = 0
+    update_seconds = 0.0
 
     def __init__(self, session: Session, count: int) -> None:
         if count < 1:
@@ -86,8 +96,20 @@ class BatchSession(ABC):
         A leading axis (b, ...) with b a divisor of the count gives one value to each of b blocks of consecutive
         entries. Weights and matrices of few blocks are cheaper than the same ones entry by entry.
         """
+        start = time.perf_counter()
         for name, value in data.items():
             self._set(name, value)
+        if all(self.given.values()):
+            self._prepare()
+        self.update_seconds += time.perf_counter() - start
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the data and of what was worked out from them, in bytes."""
+        return 0
+
+    def _prepare(self) -> None:
+        return
 
     def solve(self, data: Mapping[str, Any] | None = None) -> BatchSolution:
         """Solve all entries. Data are sticky as in `Session.solve`."""
@@ -97,8 +119,10 @@ class BatchSession(ABC):
         missing = [name for name, given in self.given.items() if not given]
         if missing:
             raise DataError(f"data never given and without default: {', '.join(missing)}; pass them to solve or update")
+        before = self.update_seconds
         solution = self._solve()
-        solution.seconds = {"solve": time.perf_counter() - start}
+        update, self.update_seconds = self.update_seconds, 0.0
+        solution.seconds = {"update": update, "solve": time.perf_counter() - start - (update - before)}
         return solution
 
     def data_of(self, entry: int) -> dict[str, np.ndarray]:
@@ -106,8 +130,8 @@ class BatchSession(ABC):
         store = self._store(entry)
         return {name: store[name].copy() for name, datum in self.layout.problem.inputs.items() if datum.of is None}
 
-    def _store(self, entry: int) -> DataStore:
-        raise NotImplementedError
+    @abstractmethod
+    def _store(self, entry: int) -> DataStore: ...
 
     def _rows(self, name: str, value: Any) -> np.ndarray:
         """(blocks, numbers of the datum), blocks = 1 where all entries share it."""
@@ -167,7 +191,7 @@ class Group:
 
 
 class QPBatch(BatchSession):
-    """Affine maps on the leading axis, QPs for violators."""
+    """Affine maps on the leading axis; see the module."""
 
     session: QPSession
 
@@ -187,10 +211,15 @@ class QPBatch(BatchSession):
         self._infinite: set[str] = set()
         for name, part in self._slices.items():
             self._note_missing(name, self.numbers[:1, part])
+        self._program = StackedProgram.of(program) if session.screens else None
+        self._applied: Applied | None = None
         self._groups: list[Group] | None = None
-        self._stacked: StackedMaps | None = None
         self._forks: list[Any] = []
         self._last: dict[int, Any] = {}
+
+    @property
+    def nbytes(self) -> int:
+        return self.numbers.nbytes + (0 if self._applied is None else self._applied.nbytes)
 
     def _set(self, name: str, value: Any) -> None:
         rows = self._rows(name, value)
@@ -201,15 +230,18 @@ class QPBatch(BatchSession):
         if name in self._slow_names:
             self._blocks[name] = blocks
             if not np.array_equal(view, np.broadcast_to(given, view.shape), equal_nan=True):
-                self._groups = None
+                self._changed()
         if self._note_missing(name, rows):
-            self._groups = None
+            self._changed()
         view[...] = given
         self.given[name] = True
         if name in self._presence:
             entry = self.layout.problem.inputs[name]
             flags = ~np.isnan(self.numbers[:, part].reshape(self.count, entry.rows, entry.size)).any(axis=2)
             self.numbers[:, self._slices[self._presence[name]]] = flags
+
+    def _changed(self) -> None:
+        self._groups = self._applied = None
 
     def _store(self, entry: int) -> DataStore:
         return self.session.store.copy(self.numbers[entry])
@@ -235,100 +267,163 @@ class QPBatch(BatchSession):
         self._missing[name] = missing
         return known is None or known.shape != missing.shape or not np.array_equal(known, missing)
 
+    def _prepare(self) -> None:
+        """Work out the maps of the data given so far, unless they are known."""
+        if self._program is not None and self._applied is None:
+            per, sets, first = self._sets()
+            maps = self._program.maps(self.numbers[first])
+            self.factorizations += len(first)
+            self._applied = Applied(maps, self._program.columns, per, sets)
+        elif self._program is None and self._groups is None:
+            _, sets, first = self._sets()
+            while len(self._forks) < len(first):
+                self._forks.append(self.session.fork())
+            groups = []
+            for number, (entry, fork) in enumerate(zip(first, self._forks, strict=False)):
+                fork.adopt(self.numbers[entry])
+                groups.append(Group(np.flatnonzero(sets == number), fork, fork.current_map()))
+            self.factorizations += len(groups)
+            self._groups = groups
+
     def _solve(self) -> BatchSolution:
-        groups = self._grouped()
+        start = time.perf_counter()
+        self._prepare()
+        self.update_seconds += time.perf_counter() - start
         numbers = clean(self.numbers) if self._missing or self._infinite else self.numbers
         out = BatchSolution(self.layout, np.empty((self.count, self.layout.size)), "linear")
-        tolerance = self.session.options.tolerance
-        if self._stacked is not None:
-            entries, violated = self._stacked(numbers, out.point, tolerance)
-            for place in violated:
-                group = groups[place // entries.shape[1]]
-                self._one(group, int(entries.flat[place]), out)
+        if self._applied is not None:
+            self._solve_stacked(self._applied, numbers, out)
             return out
-        for group in groups:
+        for group in self._groups or []:
             map_, entries = group.map, group.entries
             if map_.definite and group.session.screens:
                 z, excess = map_.many(numbers[entries])
                 out.point[entries] = z
                 if not excess.shape[1]:
                     continue
-                entries = entries[excess.max(axis=1) > tolerance]
+                entries = entries[excess.max(axis=1) > self.session.options.tolerance]
             for entry in entries:
-                self._one(group, int(entry), out)
+                self._one(group.session, int(entry), out, same_map=True)
         return out
 
-    def _one(self, group: Group, entry: int, out: BatchSolution) -> None:
+    def _solve_stacked(self, applied: Applied, numbers: np.ndarray, out: BatchSolution) -> None:
+        tolerance = self.session.options.tolerance
+        violated = applied(numbers, out.point, tolerance)
+        left = np.flatnonzero(~applied.definite)
+        if violated.size:
+            solved, iterations = applied.nearest(numbers, out.point, violated, tolerance)
+            done = violated[solved]
+            out.method[done], out.iterations[done] = self.session.solver, iterations[solved]
+            left = np.concatenate([left, violated[~solved]])
+        if not left.size:
+            return
+        if not self._forks:
+            self._forks.append(self.session.fork())
+        for entry in left.tolist():
+            self._one(self._forks[0], entry, out, same_map=False)
+
+    def _one(self, session: QPSession, entry: int, out: BatchSolution, *, same_map: bool) -> None:
         """Solve one entry by the backend."""
-        session = group.session
-        session.adopt(self.numbers[entry], same_map=True)
+        session.adopt(self.numbers[entry], same_map=same_map)
         session.last = self._last.get(entry)
         out.take(entry, session.solve_screened_out())
         self._last[entry] = session.last
 
-    def _grouped(self) -> list[Group]:
-        """Entries that share a map."""
-        if self._groups is None:
-            parts = self._parts()
-            while len(self._forks) < len(parts):
-                self._forks.append(self.session.fork())
-            groups = []
-            for entries, fork in zip(parts, self._forks, strict=False):
-                fork.adopt(self.numbers[entries[0]])
-                groups.append(Group(entries, fork, fork.current_map()))
-            self._groups, self._stacked = groups, StackedMaps.of(groups)
-        return self._groups
+    def _sets(self) -> tuple[int, np.ndarray, np.ndarray]:
+        """Which entries share a map.
 
-    def _parts(self) -> list[np.ndarray]:
+        Returns:
+            Size of the blocks of consecutive entries that certainly do, the set (count,) of every entry, and the first
+            entry of every set.
+        """
         blocks = math.lcm(*self._blocks.values()) if self._blocks else 1
         patterns = math.lcm(*(missing.shape[0] for missing in self._missing.values())) if self._missing else 1
-        if blocks < self.count or self.count == 1:
-            uniform = all((missing == missing[0]).all() for missing in self._missing.values())
-            if uniform or not blocks % patterns:
-                return list(np.arange(self.count).reshape(blocks, -1))
-        key = self.numbers[:, self._slow]
+        uniform = all((missing == missing[0]).all() for missing in self._missing.values())
+        if blocks >= self.count or not (uniform or not blocks % patterns):
+            blocks = self.count
+        per = self.count // blocks
+        key = self.numbers[::per, self._slow]
         if self._missing:
-            key = np.hstack([key, np.isnan(self.numbers)])
-        _, inverse = np.unique(key, axis=0, return_inverse=True)
-        inverse = inverse.ravel()
-        order = np.argsort(inverse, kind="stable")
-        return np.split(order, np.cumsum(np.bincount(inverse))[:-1])
+            key = np.hstack([key, np.isnan(self.numbers[::per])])
+        numbered: dict[bytes, int] = {}
+        first: list[int] = []
+        found = np.empty(blocks, np.intp)
+        for block, row in enumerate(key):
+            number = numbered.setdefault(row.tobytes(), len(numbered))
+            if number == len(first):
+                first.append(block * per)
+            found[block] = number
+        return per, np.repeat(found, per), np.array(first)
 
 
-class StackedMaps:
-    """Affine maps of groups of equal size, applied by one stacked product.
+LOOPED = 16  # sets of entries up to which each is answered by a product of its own
 
-    Attributes:
-        entries: (groups, entries per group).
+
+class Applied:
+    """Maps of a batch applied to all its entries.
+
+    Args:
+        maps: of the sets.
+        columns: of the numbers that the maps take.
+        per: size of the blocks of consecutive entries with one set.
+        sets: (count,) set of every entry.
     """
 
-    def __init__(self, groups: list[Group], maps: list[DenseMap]) -> None:
-        self.entries = np.array([group.entries for group in groups])
-        self._size = maps[0].size
-        self._T = np.array([map_.T for map_ in maps]) if len(maps) > 1 else maps[0].T[None]
-        self._t = np.array([map_.t for map_ in maps])[:, None]
-        self._in_order = bool((self.entries.ravel() == np.arange(self.entries.size)).all())
-
-    @classmethod
-    def of(cls, groups: list[Group]) -> StackedMaps | None:
-        """None where the groups are unequal or have no affine answer."""
-        maps = [group.map for group in groups if isinstance(group.map, DenseMap) and group.map.definite]
-        if len(maps) < len(groups) or not groups[0].session.screens:
-            return None
-        alike = len({group.entries.size for group in groups}) == len({map_.T.shape for map_ in maps}) == 1
-        return cls(groups, maps) if alike else None
-
-    def __call__(self, numbers: np.ndarray, point: np.ndarray, tolerance: float) -> tuple[np.ndarray, list[int]]:
-        """Fill `point`; the entries and the flat places among them that violate a row."""
-        rows = numbers if self._in_order else numbers[self.entries.ravel()]
-        out = rows.reshape(*self.entries.shape, -1) @ self._T.transpose(0, 2, 1)
-        out += self._t
-        flat = out.reshape(self.entries.size, -1)
-        if self._in_order:
-            point[...] = flat[:, : self._size]
+    def __init__(self, maps: StackedMaps, columns: np.ndarray, per: int, sets: np.ndarray) -> None:
+        self._maps, self._per, self._sets = maps, per, sets
+        ordered = columns.size and (np.diff(columns) == 1).all()
+        self._columns: Any = slice(int(columns[0]), int(columns[-1]) + 1) if ordered else columns
+        known = len(maps.T)
+        blocks = sets[::per]
+        self._looped = known <= LOOPED
+        self._all: Any = slice(None) if known == len(sets) and (np.diff(sets) == 1).all() else sets
+        if self._looped:
+            self._entries: list[Any] = (
+                [slice(None)] if known == 1 else [np.flatnonzero(sets == k) for k in range(known)]
+            )
         else:
-            point[self.entries.ravel()] = flat[:, : self._size]
-        if flat.shape[1] == self._size:
-            return self.entries, []
-        excess = flat[:, self._size :].max(axis=1)
-        return self.entries, np.flatnonzero(excess > tolerance).tolist()
+            same = known == len(blocks) and (np.diff(blocks) == 1).all()
+            self._T = maps.T if same else maps.T[blocks]
+            self._t = (maps.t if same else maps.t[blocks])[:, None]
+        self.definite = maps.definite[sets]
+
+    @property
+    def nbytes(self) -> int:
+        copied = 0 if self._looped or self._T is self._maps.T else self._T.nbytes
+        return self._maps.nbytes + copied
+
+    def __call__(self, numbers: np.ndarray, point: np.ndarray, tolerance: float) -> np.ndarray:
+        """Fill `point`; the entries that violate a row."""
+        data = numbers[:, self._columns]
+        maps = self._maps
+        if self._looped:
+            for k, entries in enumerate(self._entries):
+                point[entries] = data[entries] @ maps.T[k].T + maps.t[k]
+        else:
+            out = data.reshape(len(self._T), self._per, -1) @ self._T.transpose(0, 2, 1)
+            out += self._t
+            point[...] = out.reshape(point.shape)
+        rows = maps.rows
+        if rows is None or not rows.count:
+            return np.zeros(0, np.intp)
+        values = rows.values(self._all, point, data)
+        lower, upper = rows.bounds(self._all, numbers)
+        inside = (values <= upper + tolerance) & (values >= lower - tolerance)
+        return np.flatnonzero(~inside.all(axis=1) & self.definite)
+
+    def nearest(
+        self, numbers: np.ndarray, point: np.ndarray, entries: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Answer some entries with their rows; which of them were solved, and in how many steps."""
+        rows, half, sets = self._maps.rows, self._maps.half, self._sets[entries]
+        assert rows is not None and half is not None
+        half = half[sets]
+        A = rows.coefficients(sets) @ half
+        values = rows.values(sets, point[entries], numbers[entries][:, self._columns])
+        lower, upper = rows.bounds(sets, numbers[entries])
+        with np.errstate(invalid="ignore"):
+            b = np.concatenate([upper - values, values - lower], axis=1)
+        found = nearest_points(np.concatenate([A, -A], axis=1), b, 0.1 * tolerance)
+        solved = found.solved
+        point[entries[solved]] += (half[solved] @ found.point[solved][..., None])[..., 0]
+        return solved, found.iterations
