@@ -37,8 +37,8 @@ class LocalProblem:
         self._rows = _row_data(plan)
         if self._rows:
             self._session.update(**self._rows)
-        # a sensor that makes no rows points to a flag behind the last one, which stays 0
         self._row_sensors = plan.row_sensors.ravel()
+        self._makes_rows = (self._row_sensors >= 0).astype(float)
 
     def solve(
         self, slots: Slots, reference: np.ndarray, information: np.ndarray, predict: Callable[[], np.ndarray]
@@ -61,8 +61,8 @@ class LocalProblem:
             "moved": numbers.moved(slots.fed[1:-1]).reshape(-1, m),
         }
         active = None
-        if self._rows:
-            active = np.where(self._row_sensors >= 0, flags[:, self._row_sensors], 0.0)
+        if self._makes_rows.any():
+            active = flags[:, self._row_sensors] * self._makes_rows
             data["row active"] = active.reshape(-1, 1)
         solution = self._session.solve(data)
         status = solution.status

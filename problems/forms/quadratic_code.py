@@ -48,6 +48,7 @@ class QuadraticCode:
 
     Attributes:
         size, equalities: unknowns and equality rows that are left.
+        has_lower: some inequality has a lower bound.
     """
 
     def __init__(self, program: QuadraticProgram) -> None:
@@ -66,14 +67,19 @@ class QuadraticCode:
         inner = [self._rows(entry, Z, offset) for entry in self._bounded]
         A, shift = (ca.vertcat(first, *(part[k] for part in inner)) for k, first in enumerate(rest))
         # transposed, because CasADi stores columns and numpy rows
-        self._shapes = [(self.size, self.size), (self.size, 1), (A.shape[0], self.size), (A.shape[0], 1)]
-        self._shapes += [(layout.size, self.size), (layout.size, 1)]
-        self._pieces, self._index, self._ends = self._packed([P.T, q.T, A.T, shift.T, Z.T, offset.T])
+        shapes = [(self.size, self.size), (self.size,), (A.shape[0], self.size), (A.shape[0],)]
+        shapes += [(layout.size, self.size), (layout.size,)]
+        self._pieces, self._index, ends = self._packed([P.T, q.T, A.T, shift.T, Z.T, offset.T])
+        self._total = ends[-1]
+        self._parts = [(slice(a, b), shape) for a, b, shape in zip([0, *ends], ends, shapes, strict=False)]
         self._compile()
         rows = [_Instances(entry, template_of(entry.term).dim) for entry in self._bounded]
         self._limits = [_Limit(Bounds.of(layout, cast(Any, rows), key)) for key in ("lower", "upper")]
+        self.has_lower = not self._limits[0].absent
         self._has_cost_switch = any(entry.term.active is not None for entry in self._costs)
         self._row_flags = np.concatenate([np.zeros(0, np.intp), *self._switches(rows)])
+        always = self._row_flags < 0
+        self._always_on = always if always.any() else None
 
     def _compile(self) -> None:
         self._function = ca.Function("assemble", [self._d, self._on], [self._pieces])
@@ -122,31 +128,25 @@ class QuadraticCode:
                 + [np.zeros(n * dim, bool) if flag is None else np.repeat(~flag, dim) for flag, dim, n in parts]
             )
         elif self._row_flags.size:
-            off = (numbers[self._row_flags] == 0) & (self._row_flags >= 0)
+            off = numbers[self._row_flags] == 0
+            if self._always_on is not None:
+                off[self._always_on] = False
         self._buffer.set_arg(0, numbers.data)
         self._buffer.set_arg(1, on.data)
         self._run()
-        flat = np.zeros(self._ends[-1])
+        flat = np.zeros(self._total)
         flat[self._index] = self._values
-        P, q, A, shift, Z, offset = (
-            flat[start:end].reshape(shape)
-            for start, end, shape in zip([0, *self._ends], self._ends, self._shapes, strict=False)
-        )
-        l, u = self._bounds(numbers, shift[:, 0], off)
-        return Assembled(P, q[:, 0], A, l, u, Z, offset[:, 0])
+        P, q, A, shift, Z, offset = (flat[part].reshape(shape) for part, shape in self._parts)
+        l, u = self._bounds(numbers, shift, off)
+        return Assembled(P, q, A, l, u, Z, offset)
 
     def _bounds(self, numbers: np.ndarray, shift: np.ndarray, off: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        m = self.equalities
         l, u = -shift, -shift
-        if shift.size > m:
-            for into, limit, infinite in ((l[m:], self._limits[0], -np.inf), (u[m:], self._limits[1], np.inf)):
-                into += limit.constant
-                if limit.places is not None:
-                    given = numbers[limit.places]
-                    given[np.abs(given) >= INFINITE] = infinite
-                    into[limit.rows] += given
+        if shift.size > self.equalities:
+            for into, limit, infinite in zip((l, u), self._limits, (-np.inf, np.inf), strict=True):
+                limit.add(into[self.equalities :], numbers, infinite)
                 if off is not None:
-                    into[off] = infinite
+                    into[self.equalities :][off] = infinite
         return l, u
 
     # Symbols
@@ -266,9 +266,20 @@ class _Limit:
 
     def __init__(self, bounds: Bounds) -> None:
         by_data = bounds.index >= 0
-        self.constant = np.where(by_data, 0.0, bounds.constant)
-        self.rows: Any = slice(None) if by_data.all() else by_data
-        self.places = bounds.index[by_data] if by_data.any() else None
+        self._constant = np.where(by_data, 0.0, bounds.constant)
+        self._rows: Any = slice(None) if by_data.all() else by_data
+        self._places = bounds.index[by_data] if by_data.any() else None
+        self.absent = not by_data.any() and bool(np.isinf(bounds.constant).all())
+
+    def add(self, into: np.ndarray, numbers: np.ndarray, infinite: float) -> None:
+        if self.absent:
+            into[:] = infinite
+            return
+        into += self._constant
+        if self._places is not None:
+            given = numbers[self._places]
+            given[given >= INFINITE if infinite > 0 else given <= -INFINITE] = infinite
+            into[self._rows] += given
 
 
 class _Instances:

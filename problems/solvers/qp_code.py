@@ -51,13 +51,17 @@ class CodeSession(QPSession):
     def _unconstrained(self, program: Assembled) -> np.ndarray | None:
         """The minimiser without inequalities, where it is unique and meets them."""
         factor, info = dpotrf(program.P, lower=1)
-        if info or not (np.diagonal(factor) ** 2 > INDEPENDENT * np.diagonal(program.P)).all():
+        step = factor.shape[0] + 1
+        pivots = factor.ravel()[::step]
+        if info or not (pivots * pivots > INDEPENDENT * program.P.ravel()[::step]).all():
             return None
         v = dpotrs(factor, -program.q, lower=1)[0]
         if program.l.size:
             rows = program.A.dot(v)
             tolerance = self.options.tolerance
-            if (rows > program.u + tolerance).any() or (rows < program.l - tolerance).any():
+            if np.maximum.reduce(rows - program.u) > tolerance:
+                return None
+            if self.code.has_lower and np.maximum.reduce(program.l - rows) > tolerance:
                 return None
         return v
 
