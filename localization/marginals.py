@@ -147,6 +147,9 @@ def _frames(space: Any, values: np.ndarray) -> np.ndarray:
     return turn
 
 
+FREE = 1e-12  # share of a diagonal entry that must be left when everything before it is eliminated
+
+
 @dataclass(frozen=True, eq=False)
 class _Blocks:
     """Entries of an inverse on the pattern of the factors: for each supernode, the square of all it touches.
@@ -185,7 +188,7 @@ class _Blocks:
             L, D, order = solver.factors()
         except RuntimeError as error:
             raise UnobservableError(f"no covariance: the costs leave a direction free ({error})") from error
-        if not (D > 0).all():
+        if not (D > FREE * np.abs(upper[pattern.diagonal])[order]).all():
             raise UnobservableError("no covariance: the costs leave a direction free; add a prior or fix the gauge")
         L = csc_matrix(L)
         L.sort_indices()

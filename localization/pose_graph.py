@@ -22,7 +22,7 @@ from problems.noise import L2, Gaussian, Loss
 from problems.problem import Problem
 from problems.spaces import Vector
 
-__all__ = ["TERMS", "graph_problem", "is_odometry", "starting_values"]
+__all__ = ["TERMS", "evaluate", "graph_problem", "is_odometry", "starting_values"]
 
 TERMS = (
     "relative_poses", "odometry", "loop_closures", "sightings", "ranges", "pose_priors", "landmark_priors",
@@ -100,6 +100,22 @@ def graph_problem(
         value = problem.data("held_at", space.ambient, held.size, initial["pose"][held])
         problem.equality("held", templates.pose, pose[held], value)
     return problem, initial
+
+
+def evaluate(problem: Problem, values: Mapping[str, Any]) -> tuple[float, float]:
+    """Cost at some values by variable name, and the largest entry of its gradient on unknowns that are not held.
+
+    The problem's data are their defaults.
+    """
+    from problems.forms.layout import DataStore, Layout
+    from problems.forms.least_squares import LeastSquares
+    from problems.forms.pins import Pins
+
+    layout = Layout(problem)
+    bound = LeastSquares(problem, layout, whole=False).bind(DataStore(layout))
+    cost, gradient, _ = bound.linearize(layout.point(values))
+    gradient[Pins(layout).columns] = 0.0
+    return cost, float(np.abs(gradient).max())
 
 
 def is_odometry(graph: PoseGraph) -> np.ndarray:

@@ -17,13 +17,11 @@ from localization.io.recording import PoseGraph
 from localization.io.scoring import ate
 from localization.joining import moved
 from localization.marginals import marginal_covariances
-from localization.pose_graph import graph_problem
+from localization.pose_graph import evaluate, graph_problem
 from localization.starts import Initial, Start, choose_start
 from problems.bench.rows import finite
 from problems.bench.scenario import Outcome
 from problems.errors import AccuracyWarning, DataError, FormError, SettingError, UnobservableError
-from problems.forms.layout import DataStore, Layout
-from problems.forms.least_squares import LeastSquares
 from problems.forms.pins import Pins
 from problems.forms.template import template_of
 from problems.noise import Cauchy, GemanMcClure, Huber, Loss, Tukey
@@ -198,7 +196,7 @@ def _linear(settings: Settings, graph: PoseGraph, solver: str) -> Outcome:
     start = choose_start(graph, "chordal", _first(settings, graph), solver)
     seconds = time.perf_counter() - begin
     problem = stated(settings, graph, start)
-    cost, gradient = _cost_and_gradient(problem, start.values)
+    cost, gradient = evaluate(problem, start.values)
     trace = GraphTrace(start.values["pose"], start.values.get("landmark"), start.values["pose"], None, None, [])
     metrics = {"objective": cost, "gradient_norm": gradient, "ls_objective": cost}
     return Outcome(
@@ -232,7 +230,7 @@ def _solve(
         if best is None or (found.status not in UNUSABLE and costs[label] < costs[chosen]):
             best, chosen = found, label
     assert best is not None
-    first_cost = _cost_and_gradient(session.problem, start.values)[0]
+    first_cost = evaluate(session.problem, start.values)[0]
     linear = _linear_cost(settings, graph)
     _warn_of_basins(costs, name, chosen, first_cost, linear)
     usable = best.status not in UNUSABLE
@@ -265,15 +263,6 @@ def _solve(
     )
 
 
-def _cost_and_gradient(problem: Problem, values: Mapping[str, Any]) -> tuple[float, float]:
-    """Cost at some values, and the largest entry of its gradient on unknowns that are not held."""
-    layout = Layout(problem)
-    bound = LeastSquares(problem, layout, whole=False).bind(DataStore(layout))
-    cost, gradient, _ = bound.linearize(layout.point(values))
-    gradient[Pins(layout).columns] = 0.0
-    return cost, float(np.abs(gradient).max())
-
-
 def _linear_cost(settings: Settings, graph: PoseGraph) -> float | None:
     """Cost at the linear start, where the graph has one."""
     if len(graph.ranges):
@@ -282,7 +271,7 @@ def _linear_cost(settings: Settings, graph: PoseGraph) -> float | None:
         start = choose_start(graph, "chordal", _first(settings, graph))
     except (SettingError, DataError):
         return None
-    return _cost_and_gradient(stated(settings, graph, start), start.values)[0]
+    return evaluate(stated(settings, graph, start), start.values)[0]
 
 
 def _warn_of_basins(costs: Mapping[str, float], asked: str, chosen: str, first: float, linear: float | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -156,7 +156,8 @@ class RecordingScenario:
 
     def run(self, settings: Settings, method: str, solver: str, drawn: Drawn) -> Outcome:
         self.require_method(drawn, method)
-        return drawn.kind.run(settings, method, solver, drawn.recording, drawn.prepared)
+        outcome = drawn.kind.run(settings, method, solver, drawn.recording, drawn.prepared)
+        return replace(outcome, metrics=dict.fromkeys(self.metrics) | dict(outcome.metrics))
 
     def plot(self, settings: Settings, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
         return drawn.kind.plot(drawn.recording, {label: o.trace for label, o in outcomes.items()})

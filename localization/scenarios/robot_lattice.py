@@ -29,7 +29,7 @@ from localization.lattice import (
     team_problem,
 )
 from problems.bench.scenario import Outcome
-from problems.errors import AccuracyWarning
+from problems.errors import AccuracyWarning, FormError
 from problems.solvers.base import Status
 from problems.spaces import wrap
 
@@ -47,7 +47,9 @@ class Settings(pydantic.BaseModel):
 
     robots: int = pydantic.Field(9, ge=2, le=20_000, description="on a square lattice with a spacing of 4 m")
     pairs: Literal["one", "both"] = pydantic.Field("one", description="neighbours that measure range and bearing")
-    fence: float | None = pydantic.Field(None, ge=0, description="box around the lattice at this distance, m")
+    fence: float | None = pydantic.Field(
+        None, ge=0, description="box around the lattice at this distance, m; not for gps and agl"
+    )
     sigma_position: float = pydantic.Field(2.0, gt=0, description="of GPS, m per axis")
     sigma_heading: float = pydantic.Field(0.05, gt=0, description="of the compass, rad")
     sigma_range: float = pydantic.Field(0.1, gt=0, description="m")
@@ -77,7 +79,7 @@ class Trace:
 
 
 class RobotLatticeScenario:
-    """See the module. ``gps`` and ``agl`` call no solver and know no fence; ``ml`` starts at least squares."""
+    """See the module. ``gps`` and ``agl`` call no solver and refuse a fence; ``ml`` starts at least squares."""
 
     name = "robot-lattice"
     source = "spec gps-range-bearing-localization 6 (E3.1 to E3.4); per-robot squared errors (3.15) to (3.17)"
@@ -92,6 +94,9 @@ class RobotLatticeScenario:
         return Drawn(team, _fence(settings), int(rng.integers(2**63)))
 
     def run(self, settings: Settings, method: str, solver: str, drawn: Drawn) -> Outcome:
+        if method in self.without_solver and drawn.fence is not None:
+            others = ", ".join(name for name in self.methods if name not in self.without_solver)
+            raise FormError(f"method {method!r} of {self.name} knows no fence; leave fence out, or choose {others}")
         if method == "gps":
             robot = np.column_stack([drawn.team.gps, drawn.team.compass])
             return Outcome(metrics=_metrics(drawn.team, robot), trace=Trace(robot, None))

@@ -154,14 +154,23 @@ def test_lattice_methods_report_what_they_did(method: str) -> None:
 def test_lattice_scenario_with_a_fence_draws_its_picture() -> None:
     settings = scenario.settings(fence=0.0, rounds=10)
     drawn = scenario.draw(settings, trial_rng(2, scenario.name, 0))
-    outcomes = {m: scenario.run(settings, m, "osqp", drawn) for m in ("gps", "ls", "gls", "agl")}
+    outcomes = {m: scenario.run(settings, m, "osqp", drawn) for m in ("ls", "gls")}
     assert outcomes["ls"].trace.robot.min() > -1e-4 and outcomes["ls"].trace.robot.max() < 8 + 1e-4
     with pytest.raises(FormError, match="quadratic"):
         scenario.run(settings, "ml", "osqp", drawn)
     fenced = scenario.run(settings, "ml", "ipopt", drawn)
     assert fenced.trace.robot[:, :2].min() > -1e-4
     labels = scenario.plot(settings, drawn, outcomes | {"ml": fenced}).axes[0].get_legend_handles_labels()[1]
-    assert {"ls", "gls", "ml", "agl", "fence"} <= set(labels)
+    assert {"ls", "gls", "ml", "fence"} <= set(labels)
+
+
+@pytest.mark.parametrize("method", ["gps", "agl"])
+def test_methods_that_know_no_fence_refuse_it(method: str) -> None:
+    fenced, free = scenario.settings(fence=1.0, rounds=10), scenario.settings(rounds=10)
+    drawn = scenario.draw(fenced, trial_rng(2, scenario.name, 0))
+    with pytest.raises(FormError, match=f"'{method}' of robot-lattice knows no fence.*ls, gls, ml"):
+        scenario.run(fenced, method, "auto", drawn)
+    scenario.run(free, method, "auto", scenario.draw(free, trial_rng(2, scenario.name, 0)))
 
 
 def test_trials_repeat_and_losses_slow_agl_down() -> None:
