@@ -90,6 +90,11 @@ class Window:
             raise SettingError(f"horizon: expected a whole number of transitions of at least 1, got {horizon!r}")
         if penalty is not None and not (np.isfinite(penalty) and penalty > 0):
             raise SettingError(f"penalty: expected a positive number, got {penalty!r}")
+        for name, bounds in (("state_bounds", state_bounds), ("disturbance_bounds", disturbance_bounds)):
+            if not (bounds is None or isinstance(bounds, Polyhedron)):
+                raise SettingError(
+                    f"{name}: expected a Polyhedron such as Polyhedron.box(lower, upper), got {bounds!r}"
+                )
         if estimate_parameters and not model.parameter_size:
             raise SettingError("the model has no parameters to estimate")
         self.model, self.horizon = model, int(horizon)

@@ -68,7 +68,10 @@ class UnknownNameError(HorizonetError, LookupError):
 
     def __init__(self, kind: str, name: str, valid: Iterable[str]) -> None:
         self.kind, self.name, self.valid = kind, name, sorted(valid)
-        near = difflib.get_close_matches(name, self.valid, n=3, cutoff=0.5)
+        # what begins the same is meant even where the rest was left out
+        near = [one for one in self.valid if one.startswith(name)] or difflib.get_close_matches(
+            name, self.valid, n=3, cutoff=0.5
+        )
         hint = f"did you mean {' or '.join(near)}?" if near else f"valid: {', '.join(self.valid) or 'none'}"
         super().__init__(f"unknown {kind} {name!r}; {hint}")
 

@@ -383,7 +383,8 @@ class Problem:
 
     def _own(self, entry: Variable | Data, what: str) -> None:
         if entry.problem is not self:
-            raise DefinitionError(f"{what}: {entry!r} belongs to problem {entry.problem.name!r}, not to {self.name!r}")
+            other = "another problem of that name" if entry.problem.name == self.name else repr(entry.problem.name)
+            raise DefinitionError(f"{what}: {entry!r} is of {other}, not of this problem {self.name!r}")
 
     def _free(self, name: str, *taken: Mapping[str, Any]) -> None:
         if not isinstance(name, str) or not name:

@@ -6,6 +6,7 @@ QP rows, NLPs, graphs) is generated from these symbols; no Jacobian is written b
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -105,9 +106,22 @@ def _template(residual: Callable[..., Any], spaces: tuple[Space, ...], shapes: t
     free = [s.name() for s in ca.symvar(moved) if not any(ca.depends_on(a, s) for a in allowed)]
     if free:
         raise DefinitionError(f"the residual contains symbols that are neither slots nor data: {', '.join(free)}")
+    if _holds_nan(moved):
+        raise DefinitionError(
+            "the residual holds a constant that is not a number, as functions of `math` make of symbols; use those of "
+            "casadi or numpy"
+        )
     r, jacobian = _differentiate(moved, x, deltas, spaces)
     affine = all(isinstance(space, Vector) for space in spaces) and is_affine_in(r, ca.vertcat(*x))
     return Template(x, d, r, jacobian, tuple(space.dim for space in spaces), affine)
+
+
+def _holds_nan(expression: ca.SX) -> bool:
+    function = ca.Function("walk", ca.symvar(expression), [expression])
+    return any(
+        function.instruction_id(k) == ca.OP_CONST and np.isnan(function.instruction_constant(k))
+        for k in range(function.n_instructions())
+    )
 
 
 _STEPS = (
@@ -145,13 +159,35 @@ def _call(residual: Callable[..., Any], elements: list[Any], rows: list[ca.SX]) 
         + [f"data {tuple(r.shape)}" for r in rows]
     )
     try:
-        return residual(*elements, *rows)
+        returned = residual(*elements, *rows)
     except Exception as error:
         first = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
         raise DefinitionError(
             f"the residual {name} failed when called with symbols ({given}): {type(error).__name__}: {first}. "
-            "It must be a function of CasADi columns; write vectors as columns and use casadi functions"
+            + _advice(error, first, residual, elements, rows)
         ) from error
+    return returned
+
+
+def _advice(
+    error: Exception, message: str, residual: Callable[..., Any], elements: list[Any], rows: list[ca.SX]
+) -> str:
+    """What to do about an error in a residual."""
+    if isinstance(error, AttributeError) and any(error.obj is one for one in elements):
+        parts = [part for part in dir(error.obj) if not part.startswith("_")]
+        return f"A {type(error.obj).__name__} has {', '.join(parts)}"
+    if "truth value" in message:
+        return "Symbols have no value to decide on; write casadi.if_else(condition, a, b)"
+    try:
+        inspect.signature(residual).bind(*elements, *rows)
+    except TypeError:
+        return (
+            f"It is given one element for each slot in `on` ({len(elements)} here), then one column for each entry of "
+            f"`data` ({len(rows)} here)"
+        )
+    except ValueError:  # no signature to look at
+        pass
+    return "It must be a function of CasADi columns; write vectors as columns and use casadi or numpy functions"
 
 
 def as_column(value: Any) -> ca.SX:

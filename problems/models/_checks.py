@@ -41,8 +41,10 @@ def matrix(value: Any, rows: int | None, columns: int | None, what: str) -> np.n
     array = _numbers(value, what)
     fits = array.ndim == 2 and rows in (None, array.shape[0]) and columns in (None, array.shape[1])
     if not fits:
-        expected = f"({'any' if rows is None else rows}, {'any' if columns is None else columns})"
-        raise ShapeError(f"{what}: expected a matrix of shape {expected}, got shape {array.shape}")
+        expected = f"of shape ({'any' if rows is None else rows}, {'any' if columns is None else columns})"
+        if rows is None and columns is None:
+            expected = "with a row for each component, such as [[1.0, 0.0]]"
+        raise ShapeError(f"{what}: expected a matrix {expected}, got shape {array.shape}")
     return _frozen(np.ascontiguousarray(array))
 
 

@@ -17,7 +17,8 @@ def read_settings(kind: type[T], given: Mapping[str, Any], solver: str) -> T:
     names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
     for name in given:
         if name not in names:
-            raise SettingError(str(UnknownNameError(f"setting of solver {solver}", name, names)))
+            valid = names | {"tolerance", "time_limit", "iteration_limit"}  # which all solvers have
+            raise SettingError(str(UnknownNameError(f"setting of solver {solver}", name, valid)))
     return kind(**given)
 
 

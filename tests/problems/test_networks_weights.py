@@ -117,7 +117,7 @@ class TestWeights:
         np.testing.assert_allclose(doubly.sum(axis=0), 1, atol=1e-12)
 
     def test_metropolis_refuses_a_digraph(self) -> None:
-        with pytest.raises(TopologyError, match="Metropolis weights needs an undirected graph"):
+        with pytest.raises(TopologyError, match="Metropolis weights: the graph must be undirected"):
             metropolis_weights(RING)
 
     def test_metropolis_of_the_reference_field(self) -> None:

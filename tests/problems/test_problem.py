@@ -193,7 +193,7 @@ def test_objects_of_another_problem_are_refused() -> None:
         lambda: p.inequality("c", same, on=x, lower=w),
         lambda: p.presence(w),
     ):
-        with pytest.raises(DefinitionError, match="belongs to problem"):
+        with pytest.raises(DefinitionError, match="is of another problem"):
             bad()
     for bad in (
         lambda: p.compile(eliminate=[y]),
