@@ -12,6 +12,8 @@ from problems.spaces import SE2, wrap
 
 _UWB_ANCHORS = np.array([[2.6, 0.9, 2.0], [2.6, -0.9, 2.0], [2.6, -0.9, 0.5], [0.7, 0.9, 0.5]])
 _UWB_WAYPOINTS = np.array([[-2.5, -4.0], [50.0, -4.0], [50.0, 4.5], [30.0, -4.0], [10.0, 4.5], [10.0, -4.0]])
+UWB_LATENCY = 0.2  # s
+UWB_SPEED = 2.0  # m/s
 
 
 def write_samples(folder: str | Path, rng: np.random.Generator) -> dict[str, Path]:
@@ -40,12 +42,13 @@ def write_samples(folder: str | Path, rng: np.random.Generator) -> dict[str, Pat
 
 
 def uwb_sample(rng: np.random.Generator) -> UwbRecording:
-    """A vehicle driving the published window of trajectory A at 2.5 m/s; 9 Hz ranges of 4 anchors near the origin.
+    """A vehicle driving the published window of trajectory A at `UWB_SPEED`; 9 Hz ranges of 4 anchors near the origin.
 
-    Ranges have 0.08 m noise, one bias of about 0.1 m per anchor, and in 2 % of the rows are 1 to 8 m too short.
+    Like the recordings (spec ``recordings`` 1), ranges tell where the tag was `UWB_LATENCY` before their stamp. They have
+    0.08 m noise, one bias of about 0.1 m per anchor, and in 2 % of the rows are 1 to 8 m too short.
     """
     legs = np.linalg.norm(np.diff(_UWB_WAYPOINTS, axis=0), axis=1)
-    arrival = np.concatenate([[0.0], np.cumsum(legs) / 2.5])
+    arrival = np.concatenate([[0.0], np.cumsum(legs) / UWB_SPEED])
 
     def place(time: np.ndarray) -> np.ndarray:
         return np.column_stack([np.interp(time, arrival, column) for column in _UWB_WAYPOINTS.T])
@@ -55,7 +58,7 @@ def uwb_sample(rng: np.random.Generator) -> UwbRecording:
     course = np.diff(_UWB_WAYPOINTS, axis=0)[leg]
     time = np.arange(0.02, arrival[-1], 1 / 36)
     anchor = np.arange(len(time)) % len(_UWB_ANCHORS)
-    tag = np.column_stack([place(time), np.full(len(time), uwb_outdoor.TAG_HEIGHT)])
+    tag = np.column_stack([place(time - UWB_LATENCY), np.full(len(time), uwb_outdoor.TAG_HEIGHT)])
     bias = 0.1 + 0.05 * rng.standard_normal(len(_UWB_ANCHORS))
     noise = 0.08 * rng.standard_normal(len(time)) + bias[anchor]
     blocked = rng.random(len(time)) < 0.02
