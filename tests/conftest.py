@@ -37,15 +37,17 @@ from typing import Literal
 import numpy as np
 import pydantic
 
-from problems.bench.scenario import Outcome
-from problems.errors import ReadError
+from problems.bench.scenario import Consistency, Curve, Outcome
+from problems.errors import FormError, ReadError
 
 
 class ToySettings(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid")
     steps: int = pydantic.Field(default=4, ge=1, description="number of steps")
     tolerance: float = pydantic.Field(default=1e-6, gt=0)
-    mode: Literal["calm", "raise", "exit", "crash", "hang", "print", "warn", "unpicklable", "unreadable"] = "calm"
+    mode: Literal[
+        "calm", "raise", "exit", "crash", "hang", "print", "warn", "unpicklable", "unreadable", "unfit"
+    ] = "calm"
     offset: float = 0.0
     label: str = "1"
 
@@ -64,6 +66,8 @@ class Toy:
         return rng.normal(size=settings.steps)
 
     def run(self, settings, method, solver, drawn):
+        if settings.mode == "unfit" and solver == "slow":
+            raise FormError("solver 'slow' takes factor graphs only")
         if settings.mode == "raise" and method == "first":
             raise ArithmeticError("the estimate diverged")
         if settings.mode == "exit" and method == "first":
@@ -87,8 +91,14 @@ class Toy:
             status=Counter(solved=settings.steps - 1, inaccurate=1),
             iterations=3,
             residual=settings.tolerance / 2,
+            curves={"size": Curve(np.abs(drawn))},
+            consistency={"nees": Consistency(drawn**2, 1)},
+            estimate=None if method == "kalman" else np.array([estimate, settings.tolerance]),
             trace=(lambda: drawn) if (settings.mode, method) == ("unpicklable", "first") else drawn,
         )
+
+    def reference(self, settings, method, drawn):
+        return np.array([{"mean": drawn.mean(), "first": drawn[0]}[method], 0.0])
 
     def plot(self, settings, drawn, outcomes):
         from matplotlib.figure import Figure

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+LONG = 60  # lines of a table that a browser lays out when it comes into view
+
+
 @dataclass(frozen=True)
 class Cell:
     """A table cell.
@@ -49,9 +52,7 @@ def number_cell(shown: str, value: float | None) -> Cell:
 
 def command_cell(command: str) -> Cell:
     """A command line with a button that copies it; long ones are cut on the screen, not in what is copied."""
-    return Cell(
-        f'<button type="button" class="copy">copy</button><code title="{escape(command)}">{escape(command)}</code>'
-    )
+    return Cell(f'<button type="button" class="copy">copy</button><code>{escape(command)}</code>')
 
 
 def table(
@@ -65,11 +66,12 @@ def table(
         rows: attributes and cells of each row.
         note: printed above it.
     """
+    kind = "scroll long" if len(rows) > LONG else "scroll"
     before = f"<p>{escape(note)}</p>" if note else ""
     heads = "".join(f'<th scope="col"><button type="button">{escape(name)}</button></th>' for name in head)
     body = "\n".join(f"<tr{_attributes(attributes)}>{''.join(map(str, cells))}</tr>" for attributes, cells in rows)
     return (
-        f'{before}<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
+        f'{before}<div class="{kind}" tabindex="0" role="region" aria-label="{escape(caption)}"><table>'
         f"<caption>{escape(caption)}</caption><thead><tr>{heads}</tr></thead>\n<tbody>{body}</tbody></table></div>"
     )
 

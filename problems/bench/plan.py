@@ -99,16 +99,16 @@ def check_solver(name: str) -> None:
     Raises:
         UnknownNameError: no such solver.
         MissingExtraError: its package is not installed.
+        SettingError: it takes a further name after a colon, and none is given.
     """
-    from problems.solvers.compile import ALIASES
+    from problems.solvers.compile import ALIASES, load_solver
 
     if name == AUTO:
         return
-    registered, colon, inner = ALIASES.get(name, name).partition(":")
-    if registered not in registry.names("solvers"):
+    registered = ALIASES.get(name, name)
+    if registered.partition(":")[0] not in registry.names("solvers"):
         raise UnknownNameError("solver", name, [AUTO, *ALIASES, *registry.names("solvers")])
-    backend = registry.load("solvers", registered)
-    (backend(inner) if colon else backend).version()
+    load_solver(registered).version()
 
 
 def plan_of_names(

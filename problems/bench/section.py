@@ -18,7 +18,7 @@ from problems.bench.store import Results
 from problems.bench.summary import TRADE_OFFS, Configuration, Summary
 from problems.solvers.base import Status
 
-RESULTS_SHOWN = 1500  # lines of all tables of results; every configuration is in the CSV and Markdown files
+RESULTS_SHOWN = 1000  # lines of all tables of results; every configuration is in the CSV and Markdown files
 POINTS_SHOWN = 3000  # of all pictures
 BANDS_SHOWN = 8  # in one picture
 COMPARISONS_SHOWN = 200
@@ -82,7 +82,7 @@ class ScenarioSection:
         if swept:
             pictures.insert(1, self._accuracy(f"{self.prefix}i", DISTANCE, "iterations", most))
         pictures = [each for each in pictures if each]
-        open_ones = 2 if swept else 1
+        open_ones = 3 if swept else 1
         shown = f"<h3>Accuracy</h3>{_pictures(pictures[:open_ones])}" if pictures else ""
         if pictures[open_ones:]:
             shown += f"<details><summary>The other metrics</summary>{_pictures(pictures[open_ones:])}</details>"

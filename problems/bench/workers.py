@@ -93,6 +93,8 @@ def _in_processes(
                 for index, worker in enumerate(pool):
                     if worker.connection in ready:
                         result = worker.receive()
+                        if result is None:
+                            continue
                     elif time_limit and worker.assigned and worker.seconds_left(time_limit) <= 0:
                         result = worker.give_up(f"did not finish within the time limit of {time_limit:g} s")
                     else:
@@ -115,6 +117,7 @@ class _Worker:
         self.process.start()
         theirs.close()
         self.assigned: deque[Job] = deque()
+        self.ready = False
         self.since = 0.0
         self.alive = True
 
@@ -128,9 +131,11 @@ class _Worker:
             pass
 
     def seconds_left(self, time_limit: float) -> float:
-        return self.since + time_limit - time.monotonic() if self.assigned else time_limit
+        # starting the process is not the job's time
+        return self.since + time_limit - time.monotonic() if self.assigned and self.ready else time_limit
 
-    def receive(self) -> Result:
+    def receive(self) -> Result | None:
+        """A result, or None when the process has come up."""
         try:
             result = self.connection.recv()
         except (EOFError, OSError):
@@ -138,8 +143,11 @@ class _Worker:
             code = self.process.exitcode or 0
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             return self.give_up(f"the worker process died ({how})")
-        self.assigned.popleft()
         self.since = time.monotonic()
+        if not self.ready:
+            self.ready = True
+            return None
+        self.assigned.popleft()
         return result
 
     def give_up(self, reason: str) -> Result:
@@ -157,6 +165,7 @@ class _Worker:
 def _serve(connection: Connection, keep: frozenset[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process decides what an interrupt means
     os.dup2(2, 1)  # solvers written in C print; standard output belongs to the command
+    connection.send(None)  # everything is imported
     while True:
         try:
             job = connection.recv()

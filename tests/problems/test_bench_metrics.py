@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from problems.bench.metrics import (
+    chi_square_interval,
     mean_and_error,
     paired_difference,
     performance_profile,
@@ -78,3 +79,9 @@ def test_paired_interval_is_narrower_than_the_noise_it_shares() -> None:
 def test_solved_share() -> None:
     assert solved_share({"solved": 3, "inaccurate": 1}) == pytest.approx(0.75)
     assert solved_share({"solved": 0}) is None
+
+
+@pytest.mark.parametrize("degrees", [1, 3, 240])
+def test_chi_square_interval_equals_scipy(degrees: int) -> None:
+    expected = stats.chi2.ppf([0.025, 0.975], degrees)
+    assert chi_square_interval(degrees) == pytest.approx(tuple(expected), rel=1e-9)

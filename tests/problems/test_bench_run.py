@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from problems.bench.measure import measure
+from problems.bench.measure import POINTS, measure
 from problems.bench.plan import Plan, Study
 from problems.bench.rows import Job, Row
 from problems.bench.run import missing, run_plan
-from problems.bench.scenario import Outcome, trial_rng
+from problems.bench.scenario import Curve, Outcome, trial_rng
 from problems.bench.store import Store
 from problems.bench.workers import LocalProcesses
 
@@ -51,7 +52,14 @@ def test_methods_solvers_and_settings_of_a_trial_meet_the_same_noise() -> None:
 def test_a_row_holds_what_the_scenario_reported() -> None:
     row, outcome = measure(plan(methods=("first",), settings={"steps": 5}).jobs()[0])
     assert outcome is not None
-    assert row.metrics == {"error": outcome.metrics["error"], "never": None}
+    assert row.metrics == {"error": outcome.metrics["error"], "never": None, "distance_to_reference": 1e-6}
+    assert row.curves["size"] == {"at": [0, 1, 2, 3, 4], "values": row.curves["size"]["values"], "over": "time step"}
+    np.testing.assert_allclose(row.curves["size"]["values"], np.abs(outcome.trace), rtol=1e-5)
+    squared = outcome.trace**2
+    inside = (squared >= stats.chi2.ppf(0.025, 1)) & (squared <= stats.chi2.ppf(0.975, 1))
+    assert row.consistency["nees"] == {
+        "mean": pytest.approx(squared.mean()), "inside": inside.mean(), "degrees": 1, "samples": 5
+    }  # fmt: skip
     assert row.times == {"compile": 0.5, "solve": 5e-3}
     assert (row.steps, row.step_median, row.step_p95, row.step_max) == (5, 1e-3, 1e-3, 1e-3)
     assert row.status == {"solved": 4, "inaccurate": 1}
@@ -73,6 +81,39 @@ def test_an_estimator_that_raises_costs_its_row_only(mode: str, message: str) ->
     assert f"{failure.kind}: {failure.message}" == message
     assert "toy_scenarios.py" in failure.traceback
     assert failed[0].status == {"failed": 1}
+
+
+def test_a_curve_is_thinned_evenly_and_keeps_its_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    from problems import registry
+
+    toy = registry.load("scenarios", "toy")
+    values = np.where(np.arange(1001) % 2, np.nan, np.arange(1001) / 3)
+    made = Outcome({"error": 1.0}, curves={"c": Curve(values, at=np.arange(1001) * 0.5, over="time, s")})
+    monkeypatch.setattr(type(toy), "run", lambda *_: made)
+    curve = measure(plan().jobs()[0])[0].curves["c"]
+    assert curve["over"] == "time, s"
+    assert (len(curve["at"]), curve["at"][0], curve["at"][-1]) == (POINTS, 0.0, 500.0)
+    assert np.ptp(np.diff(curve["at"])) <= 1.0
+    assert curve["values"][0] == 0.0
+    assert curve["values"][-1] == pytest.approx(1000 / 3, rel=1e-5)
+    assert None in curve["values"]
+
+
+def test_a_scenario_without_reference_or_estimate_has_no_distance() -> None:
+    metrics = {row.job.method: row.metrics for row, _ in LocalProcesses(0).run(plan(trials=1).jobs())}
+    assert metrics["first"]["distance_to_reference"] == 1e-6
+    assert "distance_to_reference" not in metrics["kalman"]
+
+
+def test_a_pairing_that_does_not_exist_is_no_failure_and_not_tried_again(tmp_path: Path) -> None:
+    todo = plan(trials=2, methods=("mean",), solvers=("swift", "slow"), settings={"mode": "unfit"})
+    with Store(tmp_path) as store:
+        rows = list(run_plan(todo, store, LocalProcesses(0)))
+    assert [(row.job.solver, row.impossible, sum(row.status.values())) for row in rows] == [
+        ("swift", False, 4), ("slow", True, 0), ("swift", False, 4), ("slow", True, 0)
+    ]  # fmt: skip
+    with Store(tmp_path) as store:
+        assert missing(todo.jobs(), store) == []
 
 
 def test_warnings_are_part_of_the_row() -> None:
