@@ -125,6 +125,5 @@ def test_joint_problem_beside_quadprog(method: str, horizon: int, solver: str) -
         f"\n{method:13} N={horizon} {solver:8}: {rows / len(ours):5.1f} rows on, assembly and solve {one:5.0f} us, "
         f"quadprog alone {other:5.0f} us, ratio {one / other:4.1f}"
     )
-    # what is named is called in every step and answers in the library's own time; auto answers by itself where no row is
-    # violated
+    # what is named is called in every step; auto answers by itself where no row is violated
     assert one < (3 if solver == "auto" else 10) * other
