@@ -44,8 +44,8 @@ def write_samples(folder: str | Path, rng: np.random.Generator) -> dict[str, Pat
 def uwb_sample(rng: np.random.Generator) -> UwbRecording:
     """A vehicle driving the published window of trajectory A at `UWB_SPEED`; 9 Hz ranges of 4 anchors near the origin.
 
-    Like the recordings (spec ``recordings`` 1), ranges tell where the tag was `UWB_LATENCY` before their stamp. They have
-    0.08 m noise, one bias of about 0.1 m per anchor, and in 2 % of the rows are 1 to 8 m too short.
+    Like the recordings (spec ``recordings`` 1), ranges tell where the tag was `UWB_LATENCY` before their stamp. They
+    have 0.08 m noise, one bias of about 0.1 m per anchor, and in 2 % of the rows are 1 to 8 m too short.
     """
     legs = np.linalg.norm(np.diff(_UWB_WAYPOINTS, axis=0), axis=1)
     arrival = np.concatenate([[0.0], np.cumsum(legs) / UWB_SPEED])
