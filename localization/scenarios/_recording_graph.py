@@ -21,7 +21,7 @@ from localization.pose_graph import evaluate, graph_problem
 from localization.starts import Initial, Start, choose_start
 from problems.bench.rows import finite
 from problems.bench.scenario import Outcome
-from problems.errors import AccuracyWarning, DataError, FormError, SettingError, UnobservableError
+from problems.errors import AccuracyWarning, DataError, SettingError, UnobservableError
 from problems.forms.pins import Pins
 from problems.forms.template import template_of
 from problems.noise import Cauchy, GemanMcClure, Huber, Loss, Tukey
@@ -69,6 +69,11 @@ class GraphMethods:
         "fence", "edges", "tolerance", "iteration_limit", "time_limit", "covariance",
     )  # fmt: skip
     outputs = (".csv", ".g2o", ".tum")
+
+    @classmethod
+    def possible(cls, recording: PoseGraph) -> tuple[str, ...]:
+        """Methods that fit: linear least squares takes no ranges."""
+        return ("ml",) if len(recording.ranges) else cls.methods
 
     @staticmethod
     def prepare(settings: Settings, recording: PoseGraph, rng: np.random.Generator) -> None:
@@ -188,10 +193,6 @@ def _starts(settings: Settings, graph: PoseGraph) -> dict[str, Start]:
 
 def _linear(settings: Settings, graph: PoseGraph, solver: str) -> Outcome:
     """Method ``ls``: chordal orientations and linear positions as they are, under the cost of method ``ml``."""
-    if len(graph.ranges):
-        raise FormError(
-            f"method 'ls' cannot localize {graph.name}: its {len(graph.ranges)} ranges are not linear; possible: ml"
-        )
     begin = time.perf_counter()
     start = choose_start(graph, "chordal", _first(settings, graph), solver)
     seconds = time.perf_counter() - begin

@@ -34,6 +34,12 @@ class UwbMethods:
     settings = (*TRACKER, "trajectory", "start", "delay", "gps_rate", "covariance")
     outputs = (".csv", ".tum")
 
+    @classmethod
+    def possible(cls, recording: UwbRecording) -> tuple[str, ...]:
+        """Methods that fit."""
+        del recording
+        return cls.methods
+
     @staticmethod
     def prepare(settings: Settings, recording: UwbRecording, rng: np.random.Generator) -> TimeSeries | None:
         """Coarse fixes; raises where the settings need truth that is not there."""

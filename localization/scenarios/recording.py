@@ -101,6 +101,7 @@ class Kind(Protocol):
     settings: tuple[str, ...]
     outputs: tuple[str, ...]
 
+    def possible(self, recording: Any) -> tuple[str, ...]: ...
     def prepare(self, settings: Any, recording: Any, rng: np.random.Generator) -> Any: ...
     def run(self, settings: Any, method: str, solver: str, recording: Any, prepared: Any) -> Outcome: ...
     def plot(self, recording: Any, traces: dict[str, Any]) -> Figure: ...
@@ -147,12 +148,11 @@ class RecordingScenario:
         return Drawn(recording, kind, kind.prepare(settings, recording, rng))
 
     def require_method(self, drawn: Drawn, method: str) -> None:
-        """Raises FormError where the recording's kind has no such method; names those it has."""
-        if method not in drawn.kind.methods:
-            raise FormError(
-                f"method {method!r} cannot localize {drawn.kind.what} ({drawn.recording.name}); possible: "
-                f"{', '.join(drawn.kind.methods)}"
-            )
+        """Raises FormError where the method does not fit the recording; names those that do."""
+        possible = drawn.kind.possible(drawn.recording)
+        if method not in possible:
+            what = f"{drawn.kind.what} ({drawn.recording.name})"
+            raise FormError(f"method {method!r} cannot localize {what}; possible: {', '.join(possible)}")
 
     def run(self, settings: Settings, method: str, solver: str, drawn: Drawn) -> Outcome:
         self.require_method(drawn, method)
