@@ -15,7 +15,7 @@ import pydantic
 
 from problems import registry
 from problems.bench.rows import Job
-from problems.bench.scenario import NO_SOLVER, Scenario, takes_solver
+from problems.bench.scenario import NO_SOLVER, Scenario, takes_method, takes_solver
 from problems.bench.settings import complete, convert
 from problems.errors import ReadError, SettingError, UnknownNameError
 
@@ -49,7 +49,7 @@ class Study(pydantic.BaseModel):
         """
         scenario: Scenario = registry.load("scenarios", self.scenario)
         for method in self.methods:
-            if method not in scenario.methods:
+            if not takes_method(scenario, method):
                 raise UnknownNameError(f"method of {self.scenario}", method, scenario.methods)
         for solver in self.solvers:
             check_solver(solver)
@@ -135,7 +135,7 @@ def plan_of_names(
     loaded: list[Scenario] = [registry.load("scenarios", name) for name in scenarios]
     where = " or ".join(scenarios)
     for method in methods:
-        if not any(method in scenario.methods for scenario in loaded):
+        if not any(takes_method(scenario, method) for scenario in loaded):
             raise UnknownNameError(f"method of {where}", method, {name for one in loaded for name in one.methods})
     for key in settings:
         if not any(key in scenario.settings.model_fields for scenario in loaded):
@@ -143,7 +143,7 @@ def plan_of_names(
             raise UnknownNameError(f"setting of {where}", key, known)
     studies = []
     for scenario in loaded:
-        chosen = tuple(method for method in methods if method in scenario.methods)
+        chosen = tuple(method for method in methods if takes_method(scenario, method))
         if methods and not chosen:
             raise UnknownNameError(f"method of {scenario.name}", methods[0], scenario.methods)
         known = {key: list(values) for key, values in settings.items() if key in scenario.settings.model_fields}

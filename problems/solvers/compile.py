@@ -46,19 +46,30 @@ def compile_problem(
     return session
 
 
+def load_solver(solver: str) -> Any:
+    """What is registered under a solver's name, for the name after the colon where there is one.
+
+    Raises:
+        UnknownNameError: no such solver, or one that takes no further name.
+        SettingError: a solver that takes one, without it.
+    """
+    name, _, inner = solver.partition(":")
+    entry = registry.load("solvers", name)
+    # what takes a name after the colon is a function, or a class that says so
+    if getattr(entry, "named", not isinstance(entry, type)):
+        return entry(inner)
+    if inner:
+        raise UnknownNameError("solver", solver, registry.names("solvers"))
+    return entry
+
+
 def _session(
     problem: Problem, solver: str, form: str | None, eliminate: Sequence[Any], settings: dict[str, Any]
 ) -> Session:
     auto = solver == "auto"
     if auto and (form == "quadratic" or (form is None and is_affine(problem))):
         return _quadratic(problem, solver, None, eliminate, settings)
-    name, _, inner = solver.partition(":")
-    entry = registry.load("solvers", "gauss-newton" if auto else name)
-    # what takes a name after the colon is a function, or a class that says so
-    if getattr(entry, "named", not isinstance(entry, type)):
-        entry = entry(inner)
-    elif inner:
-        raise UnknownNameError("solver", solver, registry.names("solvers"))
+    entry = load_solver("gauss-newton" if auto else solver)
     forms = getattr(entry, "forms", ("quadratic",))
     chosen = form or forms[0]
     if chosen not in forms:

@@ -316,7 +316,9 @@ class _Search:
             self.doubtful = False
             return None, step
         result, status = self.session._step.solve(hessian, gradient, entries, self.lower - values, self.upper - values)
-        if result.x is None or result.y is None or status not in (Status.SOLVED, Status.INACCURATE):
+        # a backend that stops at its limit is mostly close: the step is taken, and our own test decides at the end
+        usable = status in (Status.SOLVED, Status.INACCURATE, Status.ITERATION_LIMIT)
+        if result.x is None or result.y is None or not usable:
             return (status, f"QP step: {result.message or status}"), step
         self.multipliers = result.y
         self.doubtful = status is not Status.SOLVED

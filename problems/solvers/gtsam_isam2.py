@@ -89,7 +89,5 @@ class ISAM2(GtsamSession):
                 if tree.update(force_relinearize=True).getVariablesRelinearized() == 0:
                     return Status.SOLVED, "", iterations, found
         except Exception as error:  # a library that breaks is a status
-            self._factors = {}
-            reason = " ".join(str(error).split())
-            return Status.FAILED, f"gtsam raised {type(error).__name__}: {reason[:300]}", iterations, found
+            return self._broken(error, iterations, found)
         return Status.ITERATION_LIMIT, f"not converged after {limit} iterations", iterations, found

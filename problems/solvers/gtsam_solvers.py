@@ -83,6 +83,7 @@ class GtsamSession(Session):
     optimizer: ClassVar[str]
     settings_type: ClassVar[type]
     nonlinear_equalities: bool = False
+    damped: ClassVar[bool] = False
 
     def __init__(self, problem: Problem, options: Options) -> None:
         settings = checked_settings(self.settings_type, options.extra, self.name)
@@ -194,10 +195,26 @@ class GtsamSession(Session):
         import gtsam
 
         deadline = time.perf_counter() + self.options.time_limit
-        limit = self.options.iteration_limit or ITERATIONS
-        iterations, found = 0, None
         try:
             optimizer = getattr(gtsam, f"{self.optimizer}Optimizer")(graph, values, self._parameters)
+        except Exception as error:  # a library that breaks is a status
+            return self._broken(error, 0, None)
+        claim, message, iterations, found = self._iterated(optimizer, 0, deadline)
+        if not self.damped or claim is not Status.SOLVED:
+            return claim, message, iterations, found
+        # damping holds weakly weighted unknowns back where the cost is flat, so undamped steps come last
+        parameters = gtsam.GaussNewtonParams()
+        parameters.setLinearSolverType(self._parameters.getLinearSolverType())
+        free = gtsam.GaussNewtonOptimizer(graph, found, parameters)
+        undamped, _, total, polished = self._iterated(free, iterations, deadline)
+        if polished is None or undamped is Status.FAILED or graph.error(polished) > optimizer.error() * (1 + 1e-14):
+            return claim, message, iterations, found
+        return claim, message, total, polished
+
+    def _iterated(self, optimizer: Any, iterations: int, deadline: float) -> tuple[Status, str, int, Any]:
+        """Iterate until the cost stays, counting on from `iterations`."""
+        limit, found = self.options.iteration_limit or ITERATIONS, None
+        try:
             cost = optimizer.error()
             while iterations < limit:
                 optimizer.iterate()
@@ -212,16 +229,20 @@ class GtsamSession(Session):
                     message = f"stopped after {self.options.time_limit:g} s"
                     return Status.TIME_LIMIT, message, iterations, found
         except Exception as error:  # a library that breaks is a status
-            self._factors = {}
-            reason = " ".join(str(error).split())
-            return Status.FAILED, f"gtsam raised {type(error).__name__}: {reason[:300]}", iterations, found
+            return self._broken(error, iterations, found)
         return Status.ITERATION_LIMIT, f"not converged after {limit} iterations", iterations, found
+
+    def _broken(self, error: Exception, iterations: int, found: Any) -> tuple[Status, str, int, Any]:
+        self._factors = {}
+        reason = " ".join(str(error).split())
+        return Status.FAILED, f"gtsam raised {type(error).__name__}: {reason[:300]}", iterations, found
 
 
 class LevenbergMarquardt(GtsamSession):
-    """Session of the solver ``gtsam-lm``."""
+    """Session of the solver ``gtsam-lm``: damped steps, and undamped ones at the end."""
 
     name = "gtsam-lm"
+    damped = True
     optimizer = "LevenbergMarquardt"
     settings_type = LevenbergMarquardtSettings
 
@@ -266,6 +287,7 @@ class GraduatedNonConvexity(GtsamSession):
     """
 
     name = "gtsam-gnc"
+    damped = True
     optimizer = "LevenbergMarquardt"
     settings_type = GNCSettings
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import time
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata
@@ -110,12 +111,13 @@ class NLPSession(Session):
         super().reset()
         self._multipliers = None
 
+    @abstractmethod
     def _make(self) -> None:
-        raise NotImplementedError
+        """Make the plugin's function."""
 
+    @abstractmethod
     def _call(self, arguments: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Results and statistics of the plugin."""
-        raise NotImplementedError
 
     def _nlpsol(self, options: Mapping[str, Any], derivatives: bool) -> ca.Function:
         common = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
@@ -261,6 +263,10 @@ class SQP:
 
     Args:
         backend: name of a registered QP backend.
+
+    Raises:
+        FormError: NAME is no QP backend.
+        UnknownNameError, MissingExtraError: it is nothing; its package is not installed.
     """
 
     named: ClassVar[bool] = True
@@ -271,11 +277,10 @@ class SQP:
     def __init__(self, backend: str) -> None:
         if not backend:
             raise SettingError("solver 'sqp' needs the name of a QP backend, for example 'sqp:osqp'")
+        qp_backend(backend)
         self.backend = backend
 
     def compile(self, problem: Problem, form: str, options: Options) -> Session:
-        """Raises FormError where NAME is no QP backend, UnknownNameError where it is nothing."""
-        qp_backend(self.backend)
         extra = {**options.extra, "qp_solver": self.backend, "screen": False}
         session = GaussNewton(problem, replace(options, extra=extra))
         session.solver = f"sqp:{self.backend}"

@@ -13,7 +13,7 @@ import numpy as np
 from problems.errors import FormError
 from problems.forms.stages import find_stages
 from problems.solvers.base import Options, QPResult, Status
-from problems.solvers.qp_support import Backend, Warm, checked_settings, native
+from problems.solvers.qp_support import Backend, Warm, checked_settings, interior_tolerance, native
 
 _LIMITED = "SOLVER_RET_LIMITED"
 
@@ -251,14 +251,14 @@ class HPIPM(_Conic):
 
     def _plugin_options(self) -> dict[str, Any]:
         common = self._options
-        half = 0.5 * common.tolerance
+        tolerance = interior_tolerance(common.tolerance)
         inner = native(
             self._settings,
-            res_g_max=half,
-            res_b_max=half,
+            res_g_max=tolerance,
+            res_b_max=tolerance,
             # the rounding of what stands for an infinite bound is what the residual of bounds cannot get below
-            res_d_max=max(half, 4.0 * np.finfo(float).eps * self._infinity),
-            res_m_max=half,
+            res_d_max=max(tolerance, 4.0 * np.finfo(float).eps * self._infinity),
+            res_m_max=tolerance,
             lam_min=1e-25,
             iter_max=common.iteration_limit,
         )
@@ -329,11 +329,13 @@ class HPIPM(_Conic):
         return replace(result, x=x, y=y)
 
     def _failed(self, x: np.ndarray, y: np.ndarray, iterations: int, message: str, unified: str) -> QPResult:
-        # The method stops at its limit with a point that is often good: the residuals tell.
-        if message == "1":
-            return QPResult(x, y, Status.ITERATION_LIMIT, iterations, "iteration limit reached")
-        reasons = {"2": "step length too small", "3": "NaN in the iterates"}
-        return QPResult(None, None, Status.FAILED, iterations, reasons.get(message, f"status {message}"))
+        # At its limit, or where steps get too small, it stops at a point that is often good: the residuals tell.
+        reasons = {"1": "iteration limit reached", "2": "step length too small"}
+        if message in reasons:
+            status = Status.ITERATION_LIMIT if message == "1" else Status.FAILED
+            return QPResult(x, y, status, iterations, reasons[message])
+        reason = "NaN in the iterates" if message == "3" else f"status {message}"
+        return QPResult(None, None, Status.FAILED, iterations, reason)
 
 
 def _sparsity(library: Any, matrix: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from problems.solvers.base import QPResult, Status
-from problems.solvers.qp_support import Backend, RowBlock, Rows, UpperTriangle, Warm, native
+from problems.solvers.qp_support import Backend, RowBlock, Rows, UpperTriangle, Warm, interior_tolerance, native
 
 _STATUS = {
     "Solved": Status.SOLVED,
@@ -81,8 +81,7 @@ class Clarabel(Backend):
         lib, common = self._library, self._options
         self._rows = rows = Rows.of(l, u)
         settings = lib.DefaultSettings()
-        # The library measures against the size of x and s too, so its tolerance has to be the smaller one.
-        tolerance = 0.1 * common.tolerance
+        tolerance = interior_tolerance(common.tolerance)
         values = native(
             self._settings,
             tol_feas=tolerance,

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from problems.solvers.base import QPResult, Status
-from problems.solvers.qp_support import Backend, RowBlock, Rows, Warm, native
+from problems.solvers.qp_support import Backend, RowBlock, Rows, Warm, interior_tolerance, native
 
 _STATUS = {
     "PIQP_SOLVED": Status.SOLVED,
@@ -87,12 +87,13 @@ class PIQP(Backend):
         self._is_dense = kind == "dense" or (kind == "auto" and filled)
         self._blocks = RowBlock(self._A, [(rows.equal, 1.0)]), RowBlock(self._A, [(rows.between, 1.0)])
         solver = lib.DenseSolver() if self._is_dense else lib.SparseSolver()
+        tolerance = interior_tolerance(common.tolerance)
         values = native(
             self._settings,
-            eps_abs=0.5 * common.tolerance,
-            eps_rel=0.5 * common.tolerance,
-            eps_duality_gap_abs=0.5 * common.tolerance,
-            eps_duality_gap_rel=0.5 * common.tolerance,
+            eps_abs=tolerance,
+            eps_rel=tolerance,
+            eps_duality_gap_abs=tolerance,
+            eps_duality_gap_rel=tolerance,
             max_iter=common.iteration_limit,
         )
         values.pop("backend")

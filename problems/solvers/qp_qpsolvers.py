@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from problems.errors import MissingExtraError, UnknownNameError
+from problems.errors import MissingExtraError, SettingError, UnknownNameError
 from problems.solvers.base import Options, QPResult, Status
 from problems.solvers.qp_support import Backend, RowBlock, Rows, Warm
 
@@ -138,7 +138,10 @@ class Named:
         Raises:
             MissingExtraError: qpsolvers is not installed.
             UnknownNameError: the solver is not known to qpsolvers, or its package is not installed.
+            SettingError: no name is given.
         """
+        if not name:
+            raise SettingError("solver 'qpsolvers' needs the name of one of its solvers, for example 'qpsolvers:ecos'")
         try:
             import qpsolvers
         except ImportError as error:
