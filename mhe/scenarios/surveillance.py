@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 from mhe.scenarios._surveillance_metrics import METRICS, error_norms, errors_of, in_window, outside, over_nodes, share
 from mhe.scenarios._surveillance_settings import Settings
 from mhe.scenarios._surveillance_world import Drawn, World, draw, world_of
-from mhe.sporadic import METHODS, SporadicEstimator
+from mhe.sporadic import METHODS, BatchedDetections, SporadicEstimator
 from mhe.sporadic.recordings import write_positions, write_readings
 from problems.bench.scenario import Curve, Outcome
 from problems.errors import ModelWarning
@@ -144,6 +144,24 @@ class Surveillance:
             curves=_curves(drawn, estimates),
             trace=Trace(estimates, unmet),
         )
+
+    def campaign(self, settings: Settings, method: str, drawn: Sequence[Drawn], solver: str = "auto") -> list[Trace]:
+        """What `run` estimates in many trials, worked out for all of them at once.
+
+        Args:
+            settings: of the scenario.
+            method: one of `methods`.
+            drawn: the trials.
+            solver: registered name.
+        """
+        estimator, _ = self._prepared(settings, method, solver)
+        batch = BatchedDetections(estimator.design, len(drawn))
+        readings, flags = (np.stack([getattr(one, name) for one in drawn], axis=1) for name in ("readings", "detected"))
+        steps = [batch.step(*given) for given in zip(readings, flags, strict=True)]
+        estimates = np.stack([step.states for step in steps], axis=1)
+        estimates = estimates.reshape(*estimates.shape[:3], settings.vehicles, 2)
+        unmet = np.stack([step.unmet for step in steps], axis=1)
+        return [Trace(*one) for one in zip(estimates, unmet, strict=True)]
 
     def score(self, settings: Settings, drawn: Drawn, trace: Trace) -> dict[str, float | None]:
         """Metrics over the instants from ``score_from`` to ``score_until``, instant 0 left out.

@@ -1,5 +1,6 @@
 """Distributed moving horizon estimation with sporadic detections and fields of view."""
 
+from mhe.sporadic.batched import BatchedDetections, DetectionBatch
 from mhe.sporadic.design import SporadicDesign
 from mhe.sporadic.estimate import DetectionEstimate
 from mhe.sporadic.estimator import SporadicEstimator
@@ -11,6 +12,8 @@ from mhe.sporadic.readings import Reading
 
 __all__ = [
     "METHODS",
+    "BatchedDetections",
+    "DetectionBatch",
     "DetectionEstimate",
     "DetectionPool",
     "Reading",

@@ -34,7 +34,7 @@ class LocalProblem:
         self._session = pool.get(plan.shape, plan.noise_gain, plan.noise, plan.options).fork()
         self._relaxed: Session | None = None
         self._shape = plan.shape.horizon + 1, plan.blocks.count, plan.blocks.size
-        self._rows = _row_data(plan)
+        self._rows = row_data(plan)
         if self._rows:
             self._session.update(**self._rows)
         self._row_sensors = plan.row_sensors.ravel()
@@ -100,7 +100,7 @@ class LocalProblem:
         return solution["x"].reshape(self._shape), Status.INFEASIBLE if unmet else solution.status, unmet
 
 
-def _row_data(plan: SporadicPlan) -> dict[str, np.ndarray]:
+def row_data(plan: SporadicPlan) -> dict[str, np.ndarray]:
     """H = G C and h of every instance of the rows; the same at every instant."""
     shape = plan.shape
     if not shape.sets:
