@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,6 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 SHAPES = "osD^vP*X<>ph"
 LINES = ("-", "--", "-.", ":")
 ROUNDING = 1e-16  # distances of answers below it are drawn at it: nobody computes them better
-Axis = Literal["time", "iterations"]
 
 
 def _styles(labels: Sequence[str]) -> dict[str, Any]:
@@ -38,10 +37,30 @@ def _styles(labels: Sequence[str]) -> dict[str, Any]:
     return styles
 
 
-def time_of(summary: Summary) -> tuple[float | None, str]:
-    """The time a picture shows for a summary, and what it is."""
-    step = summary.time["step_median"]
-    return (step, "median time of a step") if step is not None else (summary.time["solve"], "solve time of a trial")
+@dataclass(frozen=True)
+class Cost:
+    """What accuracy costs.
+
+    Attributes:
+        name: of the axis.
+        of: the value of a summary; None where it has none.
+        unit: of the axis.
+    """
+
+    name: str
+    of: Callable[[Summary], float | None]
+    unit: str = ""
+
+
+ITERATIONS = Cost("solver iterations of a trial", lambda summary: summary.iterations)
+_STEP = Cost("median time of a step", lambda summary: summary.time["step_median"], "s")
+_SOLVE = Cost("solve time of a trial", lambda summary: summary.time["solve"], "s")
+
+
+def time_of(summaries: Sequence[Summary]) -> Cost:
+    """The time by which all summaries can be compared: of a step where all have steps, else of solving a trial."""
+    finished = [summary for summary in summaries if summary.time["solve"] is not None]
+    return _STEP if all(summary.time["step_median"] is not None for summary in finished) else _SOLVE
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,22 +76,22 @@ class Marked:
     groups: list[list[Summary]]
 
 
-def accuracy_against(summaries: Sequence[Summary], metric: str, prefix: str, axis: Axis = "time") -> Marked:
+def accuracy_against(summaries: Sequence[Summary], metric: str, prefix: str, cost: Cost) -> Marked:
     """The metric (mean ± standard error) against what it costs, points of one method and solver joined by tolerance.
 
     Args:
         summaries: of one scenario.
         metric: vertical axis; smaller is better where a front is drawn.
         prefix: of the groups; their parts are ``points`` (one marker each), ``bars`` and ``line``.
-        axis: "time" of a step, or "iterations" of a trial.
+        cost: horizontal axis.
     """
     figure, axes = _figure()
-    shown = [each for each in summaries if _cost(each, axis) and each.metrics.get(metric) is not None]
+    shown = [each for each in summaries if cost.of(each) and each.metrics.get(metric) is not None]
     styles = _styles(list(dict.fromkeys(summary.label for summary in shown)))
     groups = []
     for number, (label, style) in enumerate(styles.items()):
         own = [summary for summary in shown if summary.label == label]
-        x, y, errors = np.array([(_cost(s, axis), s.metrics[metric], s.metrics_se.get(metric) or 0.0) for s in own]).T
+        x, y, errors = np.array([(cost.of(s), s.metrics[metric], s.metrics_se.get(metric) or 0.0) for s in own]).T
         y = np.maximum(y, ROUNDING) if metric == DISTANCE else y
         if errors.any():
             bars = axes.errorbar(x, y, yerr=errors, fmt="none", color=style["color"], linewidth=1)
@@ -85,18 +104,13 @@ def accuracy_against(summaries: Sequence[Summary], metric: str, prefix: str, axi
         points = axes.plot(x, y, **style | {"linestyle": "none"}, markersize=8, zorder=3)
         points[0].set_gid(f"{prefix}-points-{number}")
         groups.append(own)
-    axes.set_xscale("log")
+    _scale_of_costs(axes, cost, [cost.of(summary) or 1.0 for summary in shown])
     floor = ROUNDING if metric == DISTANCE else -np.inf
     _scale_of_values(axes, [max(summary.metrics[metric] or 0.0, floor) for summary in shown])
-    names = dict.fromkeys(time_of(summary)[1] for summary in shown)
-    axes.set_xlabel(" / ".join(names) + " in s" if axis == "time" else "solver iterations of a trial")
+    axes.set_xlabel(cost.name)
     axes.set_ylabel(metric)
     _legend(figure, styles)
     return Marked(figure, groups)
-
-
-def _cost(summary: Summary, axis: Axis) -> float | None:
-    return time_of(summary)[0] if axis == "time" else summary.iterations
 
 
 def _joined(summaries: Sequence[Summary], x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -175,6 +189,16 @@ def _figure() -> tuple[Figure, Axes]:
     axes.grid(True, which="major", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def _scale_of_costs(axes: Axes, cost: Cost, values: Sequence[float]) -> None:
+    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    close = max(values, default=1.0) < 100 * min(values, default=1.0)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if close else (1.0,), numticks=12))
+    axes.xaxis.set_major_formatter(EngFormatter(cost.unit))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _scale_of_values(axes: Axes, values: Sequence[float]) -> None:

@@ -12,6 +12,7 @@ from problems.bench.export import by_scenario
 from problems.bench.html import Cell, command_cell, number_cell, prose, table, text_cell
 from problems.bench.rows import Row
 from problems.bench.section import ScenarioSection
+from problems.bench.settings import as_text
 from problems.bench.store import Results
 from problems.bench.summary import Summary, by_configuration, configuration, reproduce, summarize
 
@@ -25,8 +26,8 @@ def page(results: Results) -> str:
     Args:
         results: rows and sessions of a folder.
     """
-    rows = by_configuration(results.rows)
-    summaries = summarize(results.rows)
+    rows = by_configuration(_in_order(results))
+    summaries = summarize(row for group in rows.values() for row in group)
     scenarios = by_scenario(summaries)
     sections = [_head(results, summaries), _filters(summaries)]
     for number_of, (name, own) in enumerate(scenarios.items()):
@@ -41,6 +42,27 @@ def page(results: Results) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">'
         f"<style>{style}</style></head>\n<body>{body}\n<script>{script}</script></body></html>\n"
     )
+
+
+def _in_order(results: Results) -> list[Row]:
+    """Rows as the plans name scenarios, methods and solvers; workers finish them in any order."""
+    studies = [study for session in results.sessions for study in session["plan"]["study"]]
+    scenarios = {name: place for place, name in reversed(list(enumerate(study["scenario"] for study in studies)))}
+    solvers = [solver for study in studies for solver in study["solvers"]]
+
+    def place(row: Row) -> tuple[Any, ...]:
+        job, methods = row.job, results.scenarios[row.job.scenario]["methods"]
+        values = tuple(
+            (str(type(value)), -value if isinstance(value, float) else value) for value in _plain(job.settings)
+        )
+        solver = solvers.index(job.solver) if job.solver in solvers else -1
+        return scenarios.get(job.scenario, -1), methods.index(job.method), solver, values, job.seed, job.trial
+
+    return sorted(results.rows, key=place)
+
+
+def _plain(settings: Mapping[str, Any]) -> list[Any]:
+    return [value if isinstance(value, int | float | str) else as_text(value) for value in settings.values()]
 
 
 def _head(results: Results, summaries: Sequence[Summary]) -> str:

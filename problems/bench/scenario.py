@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import pydantic
 
+from problems import registry
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -93,6 +95,8 @@ class Scenario(Protocol):
         metrics: names of the metrics, the main one first. Smaller is better unless the source says otherwise.
         settings: pydantic model with defaults, validation and ``extra="forbid"``.
 
+    A scenario with ``takes_estimators = True`` also runs every registered estimator under its name.
+
     A scenario with methods that solve no optimization problem (a Kalman filter) also has ``without_solver``, a tuple
     of their names; a plan then gives them one row instead of one for each solver.
 
@@ -122,6 +126,13 @@ class Scenario(Protocol):
 
 
 NO_SOLVER = "none"
+
+
+def takes_method(scenario: Scenario, method: str) -> bool:
+    """Whether the scenario knows the method by itself, or takes registered estimators and this is the name of one."""
+    if method in scenario.methods:
+        return True
+    return getattr(scenario, "takes_estimators", False) and method in registry.names("estimators")
 
 
 def takes_solver(scenario: Scenario, method: str) -> bool:

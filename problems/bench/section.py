@@ -22,6 +22,7 @@ RESULTS_SHOWN = 1000  # lines of all tables of results; every configuration is i
 POINTS_SHOWN = 3000  # of all pictures
 BANDS_SHOWN = 8  # in one picture
 COMPARISONS_SHOWN = 200
+EFFECTS_OPEN = 60  # lines
 
 T = TypeVar("T")
 
@@ -78,9 +79,10 @@ class ScenarioSection:
         drawn = [DISTANCE, *(m for m in self.metrics if m != DISTANCE)] if swept else self.metrics
         drawn = [metric for metric in drawn if any(s.metrics.get(metric) is not None for s in self.summaries)]
         most = max(1, POINTS_SHOWN // (self.share * (len(drawn) + 1)))
-        pictures = [self._accuracy(f"{self.prefix}m{k}", metric, "time", most) for k, metric in enumerate(drawn)]
+        time = plots.time_of(self.summaries)
+        pictures = [self._accuracy(f"{self.prefix}m{k}", metric, time, most) for k, metric in enumerate(drawn)]
         if swept:
-            pictures.insert(1, self._accuracy(f"{self.prefix}i", DISTANCE, "iterations", most))
+            pictures.insert(1, self._accuracy(f"{self.prefix}i", DISTANCE, plots.ITERATIONS, most))
         pictures = [each for each in pictures if each]
         open_ones = 3 if swept else 1
         shown = f"<h3>Accuracy</h3>{_pictures(pictures[:open_ones])}" if pictures else ""
@@ -88,22 +90,22 @@ class ScenarioSection:
             shown += f"<details><summary>The other metrics</summary>{_pictures(pictures[open_ones:])}</details>"
         return shown
 
-    def _accuracy(self, prefix: str, metric: str, axis: plots.Axis, most: int) -> str:
+    def _accuracy(self, prefix: str, metric: str, cost: plots.Cost, most: int) -> str:
         chosen = _sample(self.summaries, most)
-        marked = plots.accuracy_against(chosen, metric, prefix, axis)
+        marked = plots.accuracy_against(chosen, metric, prefix, cost)
         if not marked.groups:
             return ""
-        groups = [Group(marks(own[0]), [self._hover(each, metric) for each in own]) for own in marked.groups]
+        groups = [Group(marks(own[0]), [self._hover(each, metric, cost) for each in own]) for own in marked.groups]
         caption = (
-            f"{metric} against {axis}. Bars are standard errors; lines join tolerances and iteration limits of one"
+            f"{metric} against {cost.name}. Bars are standard errors; lines join tolerances and iteration limits of one"
             f" method.{_of(len(chosen), len(self.summaries))}"
         )
         return picture(marked.figure, caption, prefix, groups)
 
-    def _hover(self, summary: Summary, metric: str) -> str:
+    def _hover(self, summary: Summary, metric: str, cost: plots.Cost) -> str:
         value = number(summary.metrics.get(metric), summary.metrics_se.get(metric))
-        time, what = plots.time_of(summary)
-        lines = [summary.label, self._varied(summary), f"{metric} {value}", f"{what} {seconds(time)}"]
+        lines = [summary.label, self._varied(summary), f"{metric} {value}"]
+        lines += [f"{cost.name} {seconds(cost.of(summary))}"] if cost.unit else []
         lines.append(f"{number(summary.iterations)} iterations; {percent(solved_share(summary.status))} solved")
         return "\n".join(line for line in lines if line)
 
@@ -220,8 +222,9 @@ class ScenarioSection:
             cells += [number_cell(str(count), count) for count in counts]
             cells.append(number_cell(percent(item.infeasible_handled), item.infeasible_handled))
             body.append(({"data-method": item.method, "data-solver": item.solver}, cells))
-        head = ["method", "solver", "trials", "failed", "impossible", "steps", "solved"]
-        head += [status.value.replace("_", " ") for status in Status if status is not Status.SOLVED]
+        head = ["method", "solver", "trials", "failed trials", "impossible", "steps", "solved"]
+        head += [status.value.replace("_", " ") for status in Status if status not in (Status.SOLVED, Status.FAILED)]
+        head.append("failed steps")
         note = (
             "Steps by status over all settings. An infeasible step is handled when the estimator went on after it and"
             " the trial finished."
@@ -314,7 +317,8 @@ class ScenarioSection:
         )
         head = ["compared", "with", "method", "solver", *self.settings, self.main or "", "solve time", "iterations"]
         inner = table(f"Effects of settings in {self.name}", head, body, note)
-        return f"<details><summary>Paired differences by setting</summary>{inner}</details>"
+        opened = " open" if len(body) <= EFFECTS_OPEN else ""
+        return f"<details{opened}><summary>Paired differences by setting</summary>{inner}</details>"
 
 
 def _difference(difference: Difference | None, shown: Callable[[float], str]) -> Cell:

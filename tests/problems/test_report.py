@@ -58,6 +58,12 @@ def results(folder: Path) -> Results:
     return load(folder)
 
 
+@pytest.fixture(scope="module")
+def shown(results: Results) -> str:
+    """The page of these results."""
+    return page(results)
+
+
 class Page(html.parser.HTMLParser):
     """Tables by caption, and everything a page would load."""
 
@@ -95,13 +101,13 @@ class Page(html.parser.HTMLParser):
             self.tables[self._caption] = [row for row in self._cells if row]
 
 
-def test_every_number_of_the_results_table_follows_from_parquet(folder: Path, results: Results) -> None:
+def test_every_number_of_the_results_table_follows_from_parquet(folder: Path, shown: str) -> None:
     frame: Any = pd.read_parquet(folder / "rows.parquet")
     frame = frame[frame.scenario == "toy"]
     frame["tolerance"] = [json.loads(text)["tolerance"] for text in frame.settings]
     frame["mode"] = [json.loads(text)["mode"] for text in frame.settings]
     statuses = [name for name in frame.columns if name.startswith("status.")]
-    rows = Page(page(results)).tables["Results of toy"]
+    rows = Page(shown).tables["Results of toy"]
     assert len(rows) == 30
     for row in rows:
         method, solver, tolerance, mode = (cell[0] for cell in row[:4])
@@ -148,17 +154,17 @@ def frame_of(folder: Path) -> Any:
     return frame
 
 
-def test_the_heading_counts_what_is_in_parquet(folder: Path, results: Results) -> None:
+def test_the_heading_counts_what_is_in_parquet(folder: Path, shown: str) -> None:
     frame: Any = pd.read_parquet(folder / "rows.parquet")
     configurations = frame.groupby(["scenario", "method", "solver", "settings", "seed"]).ngroups
     failed = frame["failure.kind"].notna().sum()
-    assert f"{len(frame)} trials of {configurations} configurations, {failed} failed; seed 0." in page(results)
+    assert f"{len(frame)} trials of {configurations} configurations, {failed} failed; seed 0." in shown
 
 
-def test_the_robustness_table_follows_from_parquet(folder: Path, results: Results) -> None:
+def test_the_robustness_table_follows_from_parquet(folder: Path, shown: str) -> None:
     frame = frame_of(folder)
     statuses = [name for name in frame.columns if name.startswith("status.")]
-    rows = Page(page(results)).tables["Robustness in toy"]
+    rows = Page(shown).tables["Robustness in toy"]
     assert len(rows) == 5
     for row in rows:
         found = frame[(frame.method == row[0][0]) & (frame.solver == row[1][0])]
@@ -172,11 +178,11 @@ def test_the_robustness_table_follows_from_parquet(folder: Path, results: Result
         assert row[13][1] == ""  # nothing was infeasible
 
 
-def test_the_consistency_table_follows_from_parquet(folder: Path, results: Results) -> None:
+def test_the_consistency_table_follows_from_parquet(folder: Path, shown: str) -> None:
     frame = frame_of(folder)
-    rows = Page(page(results)).tables["Consistency in toy"]
+    rows = Page(shown).tables["Consistency in toy"]
     assert [(row[0][0], row[1][0]) for row in rows] == [
-        ("mean", "swift"), ("first", "swift"), ("kalman", "none"), ("mean", "swift"), ("kalman", "none")
+        ("mean", "swift"), ("mean", "swift"), ("first", "swift"), ("kalman", "none"), ("kalman", "none")
     ]  # fmt: skip
     for row in rows:
         found = frame[(frame.method == row[0][0]) & (frame.solver == row[1][0]) & (frame["mode"] == row[4][0])]
@@ -197,9 +203,9 @@ def test_the_consistency_table_follows_from_parquet(folder: Path, results: Resul
         assert row[7][0] == f"[{number(lower)}, {number(upper)}]"
 
 
-def test_the_tables_of_solvers_follow_from_parquet(folder: Path, results: Results) -> None:
+def test_the_tables_of_solvers_follow_from_parquet(folder: Path, results: Results, shown: str) -> None:
     frame = frame_of(folder)
-    rows = Page(page(results)).tables["Solvers of toy on mean, first"]
+    rows = Page(shown).tables["Solvers of toy on mean, first"]
     frame = frame[frame.method.isin(["mean", "first"])]
     for row in rows:
         found = frame[frame.solver == row[0][0]]
@@ -209,9 +215,9 @@ def test_the_tables_of_solvers_follow_from_parquet(folder: Path, results: Result
     assert len(rows) == 2
 
 
-def test_paired_differences_follow_from_parquet(folder: Path, results: Results) -> None:
+def test_paired_differences_follow_from_parquet(folder: Path, shown: str) -> None:
     frame = frame_of(folder)
-    tables = Page(page(results)).tables
+    tables = Page(shown).tables
     rows = tables["Differences of error in toy"]
     assert rows
     for row in rows:
@@ -237,9 +243,9 @@ def test_paired_differences_follow_from_parquet(folder: Path, results: Results) 
     assert all(float(row[-3][1] or "nan") == 0 for row in effects)
 
 
-def test_the_texts_of_points_follow_from_parquet(folder: Path, results: Results) -> None:
+def test_the_texts_of_points_follow_from_parquet(folder: Path, shown: str) -> None:
     frame = frame_of(folder)
-    titles = re.findall(r"<title>([^<]*\nerror [^<]*)</title>", page(results))
+    titles = re.findall(r"<title>([^<]*\nerror [^<]*)</title>", shown)
     titles = [title for title in titles if "mode=" in title]
     assert len(titles) == 3 * (5 + 3)
     for title in titles:
@@ -271,9 +277,8 @@ def test_bands_are_the_mean_and_percentiles_of_the_trials(folder: Path, results:
     assert found.trials == 6
 
 
-def test_failed_trials_are_listed_with_their_message_and_command(results: Results) -> None:
-    text = page(results)
-    rows = Page(text).tables["Trials without a result"]
+def test_failed_trials_are_listed_with_their_message_and_command(shown: str) -> None:
+    rows = Page(shown).tables["Trials without a result"]
     assert [cell[0] for cell in rows[0][:3]] == ["toy", "first", "swift"]
     assert "ArithmeticError: the estimate diverged" in rows[0][3][0]
     assert "toy_scenarios.py" in rows[0][3][0]
@@ -283,26 +288,24 @@ def test_failed_trials_are_listed_with_their_message_and_command(results: Result
     )
     assert len(rows) == 7
     assert NASTY in rows[-1][3][0]
-    assert "<script>alert" not in text
+    assert "<script>alert" not in shown
 
 
-def test_the_page_is_one_file_of_balanced_html(results: Results) -> None:
-    text = page(results)
-    parsed = Page(text)
+def test_the_page_is_one_file_of_balanced_html(shown: str) -> None:
+    parsed = Page(shown)
     assert parsed.open == []
     outside = [address for address in parsed.loads if not address.startswith(("#", "data:"))]
     assert outside == []
-    assert "@import" not in text
-    assert re.findall(r"url\((?!#)", text) == []
-    assert len(text) < 2**20
-    names = re.findall(r' id="([^"]*)"', text)
+    assert "@import" not in shown
+    assert re.findall(r"url\((?!#)", shown) == []
+    assert len(shown) < 2**20
+    names = re.findall(r' id="([^"]*)"', shown)
     assert len(set(names)) == len(names)
-    assert set(re.findall(r'(?:xlink:href="#|url\(#|href="#)([\w-]+)', text)) <= set(names)
+    assert set(re.findall(r'(?:xlink:href="#|url\(#|href="#)([\w-]+)', shown)) <= set(names)
 
 
-def test_points_carry_what_filters_look_for(results: Results) -> None:
-    text = page(results)
-    groups = re.findall(r'<g data-method="(\w+)" data-solver="(\w+)">((?:(?!<g data-|</svg>).)*)', text, re.DOTALL)
+def test_points_carry_what_filters_look_for(shown: str) -> None:
+    groups = re.findall(r'<g data-method="(\w+)" data-solver="(\w+)">((?:(?!<g data-|</svg>).)*)', shown, re.DOTALL)
     titles = {
         (method, solver): re.findall("<title>([^<]+)</title>", inner)
         for method, solver, inner in groups
@@ -315,14 +318,14 @@ def test_points_carry_what_filters_look_for(results: Results) -> None:
     for (method, _), texts in titles.items():
         assert all(title.startswith(method) for title in texts)
     assert any("tolerance=1e-09" in title and "75 % solved" in title for title in titles["mean", "slow"])
-    assert len(re.findall('<g data-solver="slow">', text)) == 1  # its line of the performance profile
+    assert len(re.findall('<g data-solver="slow">', shown)) == 1  # its line of the performance profile
     for part in ("points", "bars", "line", "band"):
-        assert f"-{part}-" not in text
+        assert f"-{part}-" not in shown
 
 
 def test_the_picture_joins_the_tolerances_of_one_method_and_solver(results: Results) -> None:
     summaries = [s for s in summarize(results.rows) if s.scenario == "toy" and s.settings["mode"] == "calm"]
-    marked = plots.accuracy_against(summaries, "error", "p")
+    marked = plots.accuracy_against(summaries, "error", "p", plots.time_of(summaries))
     axes: Any = marked.figure.axes[0]
     lines = [line for line in axes.lines if "-line-" in (line.get_gid() or "")]
     assert len(lines) == len(marked.groups) == 5
@@ -339,7 +342,7 @@ def test_the_picture_joins_the_tolerances_of_one_method_and_solver(results: Resu
 
 def test_lines_of_other_settings_are_not_joined(results: Results) -> None:
     summaries = [s for s in summarize(results.rows) if (s.scenario, s.method, s.solver) == ("toy", "mean", "swift")]
-    axes: Any = plots.accuracy_against(summaries, "error", "p").figure.axes[0]
+    axes: Any = plots.accuracy_against(summaries, "error", "p", plots.time_of(summaries)).figure.axes[0]
     line = next(line for line in axes.lines if "-line-" in (line.get_gid() or ""))
     assert np.isnan(line.get_xdata()).nonzero()[0].tolist() == [3, 7]  # calm and raise apart
 
@@ -348,7 +351,7 @@ def test_distances_of_zero_leave_the_axis_logarithmic(results: Results) -> None:
     summaries = [s for s in summarize(results.rows) if s.scenario == "toy" and s.method == "mean"]
     for summary in summaries[:1]:
         summary.metrics["distance_to_reference"] = 0.0
-    axes: Any = plots.accuracy_against(summaries, "distance_to_reference", "p").figure.axes[0]
+    axes: Any = plots.accuracy_against(summaries, "distance_to_reference", "p", plots.ITERATIONS).figure.axes[0]
     assert axes.get_yscale() == "log"
     assert min(line.get_ydata().min() for line in axes.lines if "-points-" in (line.get_gid() or "")) == plots.ROUNDING
 
@@ -534,9 +537,9 @@ def browse(path: Path, address: str, *options: str, timing: bool = False) -> sub
 
 @pytest.mark.browser
 @BROWSER
-def test_the_page_renders_without_console_messages(results: Results, tmp_path: Path) -> None:
+def test_the_page_renders_without_console_messages(tmp_path: Path, shown: str) -> None:
     path, picture = tmp_path / "report.html", tmp_path / "report.png"
-    path.write_text(page(results), encoding="utf-8")
+    path.write_text(shown, encoding="utf-8")
     done = browse(path, "", "--window-size=1300,2400", f"--screenshot={picture}")
     assert "CONSOLE" not in done.stderr
     from matplotlib.image import imread
@@ -548,7 +551,7 @@ def test_the_page_renders_without_console_messages(results: Results, tmp_path: P
 
 @pytest.mark.browser
 @BROWSER
-def test_filters_and_sorting_work_in_the_browser(results: Results, tmp_path: Path) -> None:
+def test_filters_and_sorting_work_in_the_browser(tmp_path: Path, shown: str) -> None:
     path = tmp_path / "report.html"
     probe = """<script>
       const rows = () => [...document.querySelectorAll("tr.result:not([hidden])")];
@@ -564,7 +567,7 @@ def test_filters_and_sorting_work_in_the_browser(results: Results, tmp_path: Pat
       button.click(); const up = values(); button.click(); const down = values();
       document.title = JSON.stringify({off, filtered, fewer, address, up, down});
     </script>"""
-    path.write_text(page(results).replace("</body>", probe + "</body>"), encoding="utf-8")
+    path.write_text(shown.replace("</body>", probe + "</body>"), encoding="utf-8")
     done = browse(path, "#no-method=kalman", "--dump-dom")
     assert "CONSOLE" not in done.stderr
     title = re.search(r"<title>(\{.*?\})</title>", done.stdout)
@@ -588,7 +591,7 @@ def html_unescape(text: str) -> str:
 
 @pytest.mark.browser
 @BROWSER
-def test_points_are_reached_by_the_arrow_keys(results: Results, tmp_path: Path) -> None:
+def test_points_are_reached_by_the_arrow_keys(tmp_path: Path, shown: str) -> None:
     path = tmp_path / "report.html"
     probe = """<script>
       const figure = [...document.querySelectorAll("figure")].find((one) => one.querySelector(".point"));
@@ -609,7 +612,7 @@ def test_points_are_reached_by_the_arrow_keys(results: Results, tmp_path: Path) 
       const back = document.querySelectorAll("tr.result:not([hidden])").length;
       document.title = JSON.stringify({told, focused, shown, gone, left, back});
     </script>"""
-    path.write_text(page(results).replace("</body>", probe + "</body>"), encoding="utf-8")
+    path.write_text(shown.replace("</body>", probe + "</body>"), encoding="utf-8")
     done = browse(path, "", "--dump-dom")
     assert "CONSOLE" not in done.stderr
     title = re.search(r"<title>(\{.*?\})</title>", done.stdout)
@@ -668,7 +671,8 @@ def large(rows: int, configurations: int) -> Results:
         )
     session = {
         "started": "2026-01-01T00:00:00+00:00",
-        "plan": {"name": "large", "text": "", "seed": 0, "trials": rows // configurations, "time_limit": 10.0},
+        "plan": {"name": "large", "text": "", "seed": 0, "trials": rows // configurations, "time_limit": 10.0}
+        | {"study": []},
         "scenarios": {name: facts for name in ("alpha", "beta")},
         "machine": {"processor": "p", "cores": 2, "system": "s", "python": "3", "workers": 1}
         | {"threads": {}, "versions": {}},
