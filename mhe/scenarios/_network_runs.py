@@ -57,6 +57,7 @@ class NetworkScenario(ABC):
 
     name: ClassVar[str]
     methods: ClassVar[tuple[str, ...]] = METHODS
+    takes_estimators: ClassVar[bool] = True
     without_solver: ClassVar[tuple[str, ...]] = ("kf",)
     metrics: ClassVar[tuple[str, ...]]
 
@@ -82,7 +83,7 @@ class NetworkScenario(ABC):
         else:  # the box is the trial's own
             prepared = self._prepare(settings, method, solver, drawn)
         estimator = prepared.estimator
-        rows = slice(None) if isinstance(estimator, DistributedEstimator) else self.world(settings).rows
+        rows = slice(None) if hasattr(estimator, "network") else self.world(settings).rows
         record = _Record(drawn, bounded=settings.bounds != "none")
         started = time.perf_counter()
         estimator.reset()
@@ -119,7 +120,7 @@ class NetworkScenario(ABC):
         world = self.world(settings)
         started = time.perf_counter()
         box = None if drawn is None else drawn.box
-        gains = self.gains(settings, world) if method.endswith("_pre") else Gains(None, None)
+        gains = self.gains(settings, world) if method in METHODS and method.endswith("_pre") else Gains(None, None)
         weights = self.weights(settings, world, method)
         estimator = make_estimator(world, settings, method, solver, gains, weights, box)
         options = _options(estimator)

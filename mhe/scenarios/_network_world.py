@@ -5,6 +5,7 @@ Source: dmhe-pre-estimation section 6.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -17,6 +18,7 @@ from mhe.distributed import DistributedEstimator
 from mhe.filters import KalmanFilter
 from mhe.observers import ObserverGain, place_gain
 from mhe.polyhedron import Polyhedron
+from problems import registry
 from problems.models import LinearModel, Sensor
 from problems.networks import Network
 
@@ -148,6 +150,8 @@ def make_estimator(
         weights: options of `DistributedEstimator` about consensus weights.
         box: bounds of the states, or None.
     """
+    if method not in METHODS:
+        return _registered(world, settings, method, solver, box)
     if method == "kf":
         return KalmanFilter(world.central, initial_update=False)
     observes = method.endswith("_pre")
@@ -187,6 +191,21 @@ def make_estimator(
         **weights,
         **common,
     )
+
+
+def _registered(world: World, settings: NetworkSettings, method: str, solver: str, box: Polyhedron | None) -> Any:
+    """An estimator registered under the name of a method, with those of the settings it has arguments for."""
+    make = registry.load("estimators", method)
+    takes = inspect.signature(make).parameters
+    everything = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in takes.values())
+    given: dict[str, Any] = {"horizon": settings.horizon, "solver": solver, "tolerance": settings.tolerance}
+    if box is not None:
+        given["state_bounds"] = box
+    model = world.central
+    if "network" in takes:
+        model = world.model
+        given |= {"network": world.network, "placement": world.placement}
+    return make(model, **{name: value for name, value in given.items() if everything or name in takes})
 
 
 def consensus_weights(network: Network, rule: str) -> dict[str, Any]:
