@@ -103,8 +103,8 @@ def test_the_scenario_runs_with_any_solver(installed: dict[str, str], tmp_path: 
 def test_the_estimator_is_a_method(installed: dict[str, str]) -> None:
     words = ["run", "four-state-ring", "--method", "kf", "--method", "observer", "--trials", "2", "--json"]
     rows = {row["method"]: row for row in output(installed, *words)["rows"]}
-    assert rows["observer"]["metrics"]["rmse"] == pytest.approx(rows["kf"]["metrics"]["rmse"], rel=0.2)
-    assert rows["observer"]["metrics"]["rmse"] != rows["kf"]["metrics"]["rmse"]
+    best = rows["kf"]["metrics"]["rmse"]
+    assert best < rows["observer"]["metrics"]["rmse"] < 1.5 * best
     done = run(dict(os.environ), *words)
     assert done.returncode == 2 and "observer" in done.stderr  # not there without the package
 
