@@ -1,4 +1,4 @@
-"""Picture of a localized pose graph: from above, and from the side where it is in space."""
+"""Pictures of localized graphs (from above, and from the side where they are in space) and of teams that move."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from localization.ellipses import draw_ellipses
-from localization.io.recording import PoseGraph
+from localization.io.recording import PoseGraph, TeamRecording
 from localization.io.scoring import align
 from localization.plots import COLORS, MARKERS, STYLES
 
@@ -139,3 +139,42 @@ def _draw_errors(axes: Axes, graph: PoseGraph, traces: Mapping[str, GraphTrace])
     axes.set_ylabel("error after\nrigid alignment (m)")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
+
+
+def plot_team_tracks(recording: TeamRecording, traces: Mapping[str, Any]) -> Figure:
+    """Robots of a team from above with 95 % ellipses where there are covariances; below, errors over time.
+
+    Args:
+        traces: `localization.tracking.team_tracker.TeamTrack` by label; the first one is drawn.
+    """
+    from matplotlib.figure import Figure
+
+    label, made = next(iter(traces.items()))
+    figure = Figure(figsize=(10, 10), layout="constrained")
+    above, below = figure.subplots(2, 1, height_ratios=[3, 1])
+    for r, robot in enumerate(recording.robots):
+        color, xy = COLORS[r % len(COLORS)], made.poses[:, r, :2]
+        above.plot(*xy.T, color=color, lw=0.9, label=f"{label}, robot {robot}", zorder=2)
+        if made.covariance is not None:
+            chosen = np.unique(np.linspace(0, len(xy) - 1, ELLIPSES // 2).astype(int))
+            c, s = np.cos(made.poses[chosen, r, 2]), np.sin(made.poses[chosen, r, 2])
+            turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=1)
+            blocks = turn @ made.covariance[chosen, r, :2, :2] @ turn.swapaxes(1, 2)
+            draw_ellipses(above, xy[chosen], blocks, color)
+        if recording.truth is not None:
+            truth = recording.truth[r]
+            above.plot(*truth.value[:, :2].T, color="0.8", lw=2.5, zorder=1, label="truth" if r == 0 else None)
+            inside = (made.time >= truth.time[0]) & (made.time <= truth.time[-1])
+            at = np.column_stack([np.interp(made.time[inside], truth.time, truth.value[:, k]) for k in (0, 1)])
+            error = np.linalg.norm(xy[inside] - at, axis=1)
+            below.plot(made.time[inside], error, color=color, lw=0.7)
+    above.plot(*recording.landmarks.T, "k^", ms=8, label="landmarks", zorder=3)
+    above.set_aspect("equal", adjustable="datalim")
+    above.set_xlabel("x (m)")
+    above.set_ylabel("y (m)")
+    above.set_title(f"{recording.name}: {len(recording.robots)} robots, {len(recording.sighting_time)} sightings")
+    above.legend(loc="best", fontsize=9)
+    below.set_xlabel("time (s)")
+    below.set_ylabel("horizontal error (m)")
+    below.grid(alpha=0.3)
+    return figure

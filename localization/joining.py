@@ -149,18 +149,42 @@ def _ranged(frame: Any, start: Any, end: Any, z: Any) -> Any:
     return ca.norm_2(frame.transform_from(start) - end) - z
 
 
+def fit_frame(own: np.ndarray, other: np.ndarray, drift: float = DRIFT) -> tuple[np.ndarray, float]:
+    """The pose (3,) that brings points `own` (m, 2) onto `other` (m, 2), robustly, and its cost; `drift`: sigma, m.
+
+    Raises:
+        DataError: fewer than two different points, which leave the heading open.
+    """
+    if len(np.unique(other, axis=0)) < 2:
+        raise DataError(f"a frame needs at least two different points, got {len(np.unique(other, axis=0))}")
+    none = np.zeros((0, 2))
+    found = _minima(_Links(own, other, none, none, np.zeros(0), len(np.unique(other, axis=0))), drift)
+    return found[0][1], found[0][0]
+
+
 def _placed(graph: PoseGraph, links: _Links, chosen: np.ndarray) -> Placement:
+    found = _minima(links, DRIFT)
+    if not found:
+        raise DataError(f"{graph.name}: no frame found for the part of {graph.keys[chosen[0]]}; look at its ranges")
+    by = "+".join(["landmarks"] * bool(len(links.own)) + ["ranges"] * bool(len(links.ranges)))
+    others = tuple((x, cost) for cost, x in found[1 : 1 + OTHERS])
+    key, robot = str(graph.keys[chosen[0]]), str(graph.robots[chosen[0]])
+    return Placement(key, robot, found[0][1], found[0][0], others, by, chosen)
+
+
+def _minima(links: _Links, drift: float) -> list[tuple[float, np.ndarray]]:
+    """Costs and frames of all minima found, best first."""
     problem = Problem("frame of a part")
     frame = problem.variables("frame", SE2)
     if len(links.own):
         count = len(links.own)
         own, other = problem.data("own", 2, count, links.own), problem.data("other", 2, count, links.other)
-        problem.cost("landmarks", _matched, frame, (own, other), Gaussian(DRIFT), Cauchy(2.0))
+        problem.cost("landmarks", _matched, frame, (own, other), Gaussian(drift), Cauchy(2.0))
     if len(links.ranges):
         count = len(links.ranges)
         start, end = problem.data("start", 2, count, links.start), problem.data("end", 2, count, links.end)
         z = problem.data("ranges", (), count, links.ranges)
-        problem.cost("ranges", _ranged, frame, (start, end, z), Gaussian(DRIFT), Cauchy(2.0))
+        problem.cost("ranges", _ranged, frame, (start, end, z), Gaussian(drift), Cauchy(2.0))
     session = problem.compile("gauss-newton", whole=False)
     found: list[tuple[float, np.ndarray]] = []
     for guess in _guesses(links):
@@ -169,13 +193,7 @@ def _placed(graph: PoseGraph, links: _Links, chosen: np.ndarray) -> Placement:
         x = solution["frame"][0].copy()
         if np.isfinite(solution.objective) and all(_gap(links, x, other) > APART for _, other in found):
             found.append((float(solution.objective), x))
-    if not found:
-        raise DataError(f"{graph.name}: no frame found for the part of {graph.keys[chosen[0]]}; look at its ranges")
-    found.sort(key=lambda entry: entry[0])
-    by = "+".join(["landmarks"] * bool(len(links.own)) + ["ranges"] * bool(len(links.ranges)))
-    others = tuple((x, cost) for cost, x in found[1 : 1 + OTHERS])
-    key, robot = str(graph.keys[chosen[0]]), str(graph.robots[chosen[0]])
-    return Placement(key, robot, found[0][1], found[0][0], others, by, chosen)
+    return sorted(found, key=lambda entry: entry[0])
 
 
 def _gap(links: _Links, one: np.ndarray, other: np.ndarray) -> float:

@@ -41,11 +41,12 @@ def plot_tracks(recording: UwbRecording, tracks: Mapping[str, Track]) -> Figure:
     peaks = []
     for k, (label, made) in enumerate(tracks.items()):
         color, style = COLORS[k % len(COLORS)], STYLES[k % len(STYLES)]
-        xy = made.estimate.value
+        xy = made.estimate.value[:, :2]
         above.plot(xy[:, 0], xy[:, 1], color=color, ls=style, lw=1.2, label=label)
-        if made.covariance is not None:
+        covariance = getattr(made, "covariance", None)  # tracks with wheel odometry have none
+        if covariance is not None:
             chosen = np.unique(np.linspace(0, len(xy) - 1, ELLIPSES).astype(int))
-            draw_ellipses(above, xy[chosen, :2], made.covariance[chosen], color)
+            draw_ellipses(above, xy[chosen], covariance[chosen], color)
         if truth is not None and below is not None:
             time = made.estimate.time
             inside = (time >= truth.time[0]) & (time <= truth.time[-1])

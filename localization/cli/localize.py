@@ -12,7 +12,7 @@ def localize(
     path: Annotated[Path, typer.Argument(help="Recording: a folder or file in a known layout.")],
     method: Annotated[
         list[str] | None,
-        typer.Option(help="mhe, fixed_lag, ls, ml; may be repeated. By default mhe for UWB recordings, ml for graphs."),
+        typer.Option(help="mhe, fixed_lag, ls, ml; may be repeated. By default mhe, of graphs ml."),
     ] = None,
     solver: Annotated[str, typer.Option(help="Solver of all methods.")] = "auto",
     settings: Annotated[
@@ -27,7 +27,7 @@ def localize(
     plot: Annotated[Path | None, typer.Option(help="Draw into this file (png, svg, pdf).")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """Localize a recording: UWB folders, g2o and PyFG graphs.
+    """Localize a recording: UWB folders, MRCLAM folders, g2o and PyFG graphs.
 
     Prints errors where there is truth, ratios to published figures where there are any, and for graphs the measurements
     that contradict the others most.
@@ -178,15 +178,15 @@ def _write(path: Path, drawn: Any, made: Any) -> list[Path]:
         if suffix == ".csv":
             write_poses(path, poses)
             return [path]
-        robots = getattr(drawn.recording, "robots", np.zeros(0))
-        names = np.unique(robots)
+        tracks = drawn.kind.tracks(drawn.recording, poses)
+        names = np.unique(tracks)
         if len(names) < 2:
             write_tum(path, poses)
             return [path]
         written = []
         for name in names:
             written.append(path.with_name(f"{path.stem}-{name}{path.suffix}"))
-            write_tum(written[-1], poses.chosen(np.flatnonzero(robots == name)))
+            write_tum(written[-1], poses.chosen(np.flatnonzero(tracks == name)))
         return written
     except OSError as error:
         raise WriteError(path, str(error)) from error

@@ -119,6 +119,11 @@ class GraphMethods:
         return plot_graph(recording, traces)
 
     @staticmethod
+    def tracks(recording: PoseGraph, poses: Poses) -> np.ndarray:
+        """A trajectory per robot; landmarks come last and belong to none."""
+        return recording.robots.astype(str)
+
+    @staticmethod
     def poses(recording: PoseGraph, made: GraphTrace) -> Poses:
         """Poses and landmarks; without times of their own, poses are counted."""
         d, marks = recording.dimension, 0 if made.landmark is None else len(made.landmark)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,12 +26,84 @@ TRACKER = (
 )  # fmt: skip
 
 
+class WheelMethods:
+    """A tag on a robot with wheel odometry and anchors in the plane (labyrinth folders); see `wheeled_tracker`."""
+
+    what = "a UWB recording with wheel odometry"
+    methods = ("mhe", "ml")
+    settings = ("horizon", "bias", "odometry", "start", "covariance")
+    outputs = (".csv", ".tum")
+
+    @classmethod
+    def possible(cls, recording: UwbRecording) -> tuple[str, ...]:
+        """Methods that fit."""
+        del recording
+        return cls.methods
+
+    @staticmethod
+    def prepare(settings: Settings, recording: UwbRecording, rng: np.random.Generator) -> None:
+        """Raises SettingError for a start that needs truth which is not there."""
+        del rng
+        if settings.start == "truth" and recording.truth is None:
+            raise SettingError(f"{settings.path}: start=truth needs truth, which this recording does not have")
+
+    @staticmethod
+    def run(settings: Settings, method: str, solver: str, recording: UwbRecording, prepared: None) -> Outcome:
+        from localization.tracking.wheeled_tracker import WheeledTrackerSettings, track_wheels
+
+        del prepared
+        start = None
+        if settings.start == "truth":
+            assert recording.truth is not None
+            start = np.r_[recording.truth.value[0, :2], 0.0]
+        elif settings.start != "ranges":
+            start = np.r_[settings.start, 0.0]
+        tuned = WheeledTrackerSettings(lag=settings.horizon, bias=settings.bias)
+        made = track_wheels(
+            recording, start, tuned, batch=method == "ml", solver="gauss-newton" if solver == "auto" else solver
+        )
+        metrics: dict[str, float | None] = {
+            "objective": made.objective, "keyframes": float(len(made.estimate)),
+            "measurements": float(len(recording.time)),
+        }  # fmt: skip
+        if recording.truth is not None:
+            position = TimeSeries(made.estimate.time, made.estimate.value[:, :2])
+            metrics["rmse_2d"] = uwb_scores(recording, position)["rmse_2d"]
+        return Outcome(
+            metrics=metrics,
+            options={"prior": "filter", "horizon": "all" if method == "ml" else tuned.lag, "bias": made.bias},
+            times={"solve": float(made.step_seconds.sum())},
+            step_seconds=made.step_seconds,
+            status=made.status,
+            trace=made,
+        )
+
+    @staticmethod
+    def plot(recording: UwbRecording, traces: dict[str, Any]) -> Figure:
+        from localization.plots import plot_tracks
+
+        return plot_tracks(recording, traces)
+
+    @staticmethod
+    def tracks(recording: UwbRecording, poses: Poses) -> np.ndarray:
+        """One trajectory."""
+        del recording
+        return np.full(len(poses), "tag")
+
+    @staticmethod
+    def poses(recording: UwbRecording, made: Any) -> Poses:
+        """Poses with the recording's stamps."""
+        count, value = len(made.estimate), made.estimate.value
+        stamps = recording.start * 1e-9 + made.estimate.time
+        return Poses(stamps, np.full(count, "tag"), value[:, :2], value[:, 2:])
+
+
 class UwbMethods:
     """See the module."""
 
     what = "a UWB recording"
     methods = ("mhe", "fixed_lag", "ls", "ml")
-    settings = (*TRACKER, "trajectory", "start", "delay", "gps_rate", "covariance")
+    settings = (*TRACKER, "trajectory", "start", "delay", "gps_rate", "covariance", "odometry")
     outputs = (".csv", ".tum")
 
     @classmethod
@@ -78,6 +150,12 @@ class UwbMethods:
         from localization.plots import plot_tracks
 
         return plot_tracks(recording, traces)
+
+    @staticmethod
+    def tracks(recording: UwbRecording, poses: Poses) -> np.ndarray:
+        """One trajectory."""
+        del recording
+        return np.full(len(poses), "tag")
 
     @staticmethod
     def poses(recording: UwbRecording, made: Track) -> Poses:

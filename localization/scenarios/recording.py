@@ -11,9 +11,10 @@ import pydantic
 
 from localization.io.detect import open_recording
 from localization.io.poses import Poses
-from localization.io.recording import PoseGraph, UwbRecording
+from localization.io.recording import PoseGraph, TeamRecording, UwbRecording
 from localization.scenarios._recording_graph import GraphMethods
-from localization.scenarios._recording_uwb import UwbMethods, coarse_fixes
+from localization.scenarios._recording_team import TeamMethods
+from localization.scenarios._recording_uwb import UwbMethods, WheelMethods, coarse_fixes
 from problems.bench.scenario import Outcome
 from problems.errors import FormError, SettingError
 
@@ -35,7 +36,7 @@ class Settings(pydantic.BaseModel):
     start: Literal["ranges", "truth"] | tuple[float, float] = pydantic.Field(
         "ranges",
         description="UWB: first position from the first ranges, from truth, or [x, y] in m; graphs: truth puts the "
-        "first pose of every robot at its recorded place",
+        "first pose of every robot at its recorded place; teams: from the first sightings, or from truth",
     )
     horizon: int = pydantic.Field(20, ge=1, le=1000, description="transitions in the window")
     period: float = pydantic.Field(0.1, gt=0, description="between knots, s")
@@ -55,6 +56,11 @@ class Settings(pydantic.BaseModel):
     gps_rate: float = pydantic.Field(0.0, ge=0, description="coarse fixes drawn around the truth, Hz; 0 for none")
     gps_sigma: float = pydantic.Field(2.0, gt=0, description="of those fixes, m per axis")
     covariance: bool = pydantic.Field(False, description="compute the covariance of every pose (not by ls)")
+    odometry: bool = pydantic.Field(True, description="UWB: use wheel odometry where the recording has it (mhe, ml)")
+    team_horizon: int = pydantic.Field(4, ge=1, le=1000, description="teams: keyframes in the window before the last")
+    team_period: float = pydantic.Field(0.5, gt=0, description="teams: between keyframes, s")
+    team_loss: float = pydantic.Field(1.0, ge=0, description="teams: scale of the Cauchy loss on sightings; 0 for L2")
+    sight_robots: bool = pydantic.Field(True, description="teams: use what robots see of each other")
     chart: Literal["gtsam", "plain"] = pydantic.Field(
         "gtsam", description="graphs: residual of relative poses; gtsam is the full logarithm. Their optima differ"
     )
@@ -106,9 +112,18 @@ class Kind(Protocol):
     def run(self, settings: Any, method: str, solver: str, recording: Any, prepared: Any) -> Outcome: ...
     def plot(self, recording: Any, traces: dict[str, Any]) -> Figure: ...
     def poses(self, recording: Any, made: Any) -> Poses: ...
+    def tracks(self, recording: Any, poses: Poses) -> np.ndarray: ...
 
 
-KINDS: dict[type, Any] = {UwbRecording: UwbMethods, PoseGraph: GraphMethods}
+KINDS: dict[type, Any] = {UwbRecording: UwbMethods, PoseGraph: GraphMethods, TeamRecording: TeamMethods}
+
+
+def kind_of(recording: Any, settings: Settings) -> Any:
+    """Methods for a recording, or None."""
+    if isinstance(recording, UwbRecording) and settings.odometry:
+        if recording.odometry is not None and recording.anchors.shape[1] == 2:
+            return WheelMethods
+    return KINDS.get(type(recording))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +155,7 @@ class RecordingScenario:
     def draw(self, settings: Settings, rng: np.random.Generator) -> Drawn:
         given = {} if settings.trajectory is None else {"trajectory": settings.trajectory}
         recording = open_recording(settings.path, **given)
-        kind = KINDS.get(type(recording))
+        kind = kind_of(recording, settings)
         if kind is None:
             known = ", ".join(each.what for each in KINDS.values())
             raise FormError(f"{settings.path}: read as {type(recording).__name__}; what can be localized: {known}")

@@ -175,9 +175,9 @@ def test_paths_that_cannot_be_read_name_file_and_what_was_expected(
     malformed = localize(broken)
     assert malformed.exit_code == 2
     assert "A3.csv:5: expected" in malformed.stderr
-    team = localize(samples["mrclam"])
+    team = localize(samples["mrclam"], "--method", "ml")
     assert team.exit_code == 2
-    assert "TeamRecording" in team.stderr
+    assert "method 'ml' cannot localize a team recording (mrclam); possible: mhe" in team.stderr
     for result in (missing, unknown, malformed, team):
         assert result.stdout == ""
 
@@ -216,3 +216,42 @@ def test_help_tells_where_the_settings_are(folder: Path) -> None:
     assert listed.exit_code == 0
     for name in scenario.settings.model_fields:
         assert name in listed.stdout
+
+
+def test_teams_start_at_what_they_see_and_get_a_file_per_robot(samples: dict[str, Path], tmp_path: Path) -> None:
+    words = ("--out", tmp_path / "p.csv", "--plot", tmp_path / "p.png")
+    (row,) = answer(samples["mrclam"], *words)["rows"]
+    (near,) = answer(samples["mrclam"], "--set", "start=truth", "--out", tmp_path / "p.tum")["rows"]
+    assert row["method"] == "mhe" and row["options"]["start"] == "ranges"
+    assert near["metrics"]["rmse_2d"] <= row["metrics"]["rmse_2d"] + 0.05 < 0.6
+    errors = row["options"]["rmse_2d_by_robot"]
+    assert row["metrics"]["rmse_2d"] == pytest.approx(np.mean(list(errors.values())))
+    poses = read_poses(tmp_path / "p.csv")
+    assert len(poses) == row["metrics"]["keyframes"]
+    assert poses.covariance is not None and (np.linalg.eigvalsh(poses.covariance) > 0).all()
+    for robot in errors:
+        mine = read_tum(tmp_path / f"p-robot{robot}.tum")
+        assert len(mine) == np.sum(poses.keys == f"robot{robot}")
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_wheel_odometry_is_used_where_there_is_some(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    anchors, folder = np.array([[3.0, 0.0], [0.0, 3.0], [-3.0, -1.0]]), tmp_path / "wheels"
+    folder.mkdir()
+    lines, truth = [], []
+    for k in range(200):
+        t, anchor = 0.1 * k, anchors[k % 3]
+        place = np.array([np.cos(0.3 * t), np.sin(0.3 * t)])
+        distance = np.linalg.norm(place - anchor) + 0.1 + 0.03 * rng.normal()
+        lines.append(f"range2 {t} {distance} 0.01 {anchor[0]} {anchor[1]} {k % 3} 0")
+        lines.append(f"odom2diff {t} {0.3 - 0.03} {0.3 + 0.03} 0.0 0.1 0.01 0.01 0.01")
+        truth.append(f"point2 {t} {place[0]} {place[1]} 0 0 0 0")
+    (folder / "X_Input.txt").write_text("\n".join(lines) + "\n")
+    (folder / "X_GT.txt").write_text("\n".join(truth) + "\n")
+    rows = answer(folder, "--method", "ml", "--method", "mhe", "--plot", tmp_path / "p.png")["rows"]
+    batch, causal = (row["metrics"]["rmse_2d"] for row in rows)
+    assert batch < 0.05 < 0.5 and batch < causal < 0.5
+    assert rows[0]["options"]["bias"] == pytest.approx(0.1, abs=0.03)
+    (without,) = answer(folder, "--method", "ml", "--set", "odometry=off")["rows"]
+    assert without["metrics"]["rmse_2d"] > 2 * batch

@@ -172,7 +172,7 @@ def test_planar_anchors_are_put_at_the_height_of_the_tag(samples: dict[str, Path
         lines.append(f"range2 {stamp} {distance} 0.01 {anchor[0]} {anchor[1]} {k % 3} 0")
         lines.append(f"odom2diff {stamp} 0.0 0.0 0.1 0.1 0.1 0.1 0.1")
     (tmp_path / "X_Input.txt").write_text("\n".join(lines) + "\n")
-    found = outcome(tmp_path, bias=False)
+    found = outcome(tmp_path, bias=False, odometry=False)
     t = found.trace.estimate.time
     error = found.trace.estimate.value - np.column_stack([np.cos(0.5 * t), np.sin(0.5 * t)])
     assert np.sqrt(np.mean(error[20:] ** 2)) < 0.1
@@ -180,8 +180,11 @@ def test_planar_anchors_are_put_at_the_height_of_the_tag(samples: dict[str, Path
 
 
 def test_other_recordings_are_refused_by_name(samples: dict[str, Path], tmp_path: Path) -> None:
-    with pytest.raises(FormError, match="read as TeamRecording"):
+    with pytest.raises(SettingError, match="setting horizon means nothing for a team recording"):
         outcome(samples["mrclam"])
+    team = Settings(path=str(samples["mrclam"]))
+    with pytest.raises(FormError, match="method 'ls' cannot localize a team recording .mrclam.; possible: mhe"):
+        scenario.run(team, "ls", "auto", scenario.draw(team, trial_rng(0, "recording", 0)))
     with pytest.raises(ReadError, match="an existing file or folder"):
         outcome(tmp_path / "nothing")
 
