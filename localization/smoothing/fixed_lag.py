@@ -281,26 +281,21 @@ class FixedLagSmoother:
     def _amend(self, late: Late, gated: list[tuple[str, int]]) -> tuple[int, list[float], list[float]]:
         """Enter late readings: how many had no place, and times that were used and that were too late."""
         dropped, used, too_late = 0, [], []
-        for when, measurements in late:
-            given = self._checked(measurements)
-            slot = self._slot(float(when))
-            if slot is None:
-                too_late.append(float(when))
-                continue
+        for when, given in [(float(when), self._checked(measurements)) for when, measurements in late]:
+            slot = self._slot(when)
             for name, entry in given.items():
                 places = self.window.places[name]
-                if places.first and slot == 0:
-                    too_late.append(float(when))  # the keyframe it comes from has left
+                if slot is None or (places.first and slot == 0):  # the keyframe, or the one it comes from, has left
+                    too_late.append(when)
                     continue
+                used.append(when)
                 if name in self._gates and self._solution is not None:
                     dropped += self._gate(name, self._solution, slot, entry, gated)
                 else:
                     dropped += places.enter(slot, *entry)
-            if not too_late or too_late[-1] != float(when):
-                used.append(float(when))
         if used and len(self.times) == self.window.slots:
             self.session.update(**self._data())  # the arrival cost is made from what the session knows
-        return dropped, used, too_late
+        return dropped, list(dict.fromkeys(used)), list(dict.fromkeys(too_late))
 
     def _slot(self, when: float) -> int | None:
         """Slot of the keyframe nearest in time; None where it left the window."""

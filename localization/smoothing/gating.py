@@ -34,7 +34,7 @@ class Gate:
         Where that solution leaves free what they would measure, they pass.
         """
         window, kind = self._window, self._places.kind
-        at = dict(zip(self._places.axes, self._places.combinations[number].T, strict=True))
+        at = self._places.owners(number)
         try:
             P = solution.covariance(window.keyframe(slot), *(v[:] for v in window.lasting.values()))
         except UnobservableError:

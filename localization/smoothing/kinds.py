@@ -25,12 +25,14 @@ class Lasting:
         count: how many.
         mean: (count, ambient) or (ambient,); prior and first point to linearize at.
         sigma: prior standard deviation in tangent coordinates, a number or (dim,).
+        own: one for each robot, read by that robot alone (a scale of its odometry); readings do not name it.
     """
 
     space: Space
     count: int
     mean: Any
     sigma: Any
+    own: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,8 @@ class Places:
 
     Attributes:
         kind: see `Kind`. name: of it.
+        axes: what the rows of a reading's ``at`` name.
+        own: lasting unknowns that go with the robot.
         combinations: (c, axes).
         values: (slots, c, capacity, width) NaN where nothing is held. sigma: of the same shape with dim columns.
     """
@@ -118,7 +122,8 @@ class Places:
                 f"unknown ({sorted(lasting) or 'none'})"
             )
         self.name, self.kind = name, kind
-        self.axes = [POSE, *(role for role in kind.on if role not in (POSE, BEFORE))]
+        self.own = {role for role in kind.on if role in lasting and lasting[role].own}
+        self.axes = [POSE, *(role for role in kind.on if role not in (POSE, BEFORE) and role not in self.own)]
         sizes = [robots if role in (POSE, OTHER) else lasting[role].count for role in self.axes]
         rows = list(itertools.product(*(range(size) for size in sizes)))
         if OTHER in self.axes:
@@ -170,6 +175,11 @@ class Places:
         elif readings.sigma is not None:
             raise DataError(f"readings {self.name!r}: the kind has its own noise, so readings bring no sigma")
         return number, values, sigma
+
+    def owners(self, combination: np.ndarray) -> dict[str, np.ndarray]:
+        """Indices (m,) of what combinations read, by role; `BEFORE` counts robots."""
+        at = dict(zip(self.axes, self.combinations[combination].T, strict=True))
+        return at | {role: at[POSE] for role in (BEFORE, *self.own)}
 
     def enter(self, slot: int, number: np.ndarray, values: np.ndarray, sigma: np.ndarray | None) -> int:
         """Put readings into free places of a slot; the number of those left out, as all their places are taken."""

@@ -86,6 +86,9 @@ class TeamWindow:
         taken = {POSE, BEFORE, OTHER} & set(lasting)
         if taken:
             raise DefinitionError(f"lasting unknowns cannot be called {sorted(taken)}")
+        for name, one in lasting.items():
+            if one.own and one.count != robots:
+                raise DefinitionError(f"lasting {name!r}: one for each of {robots} robots, got a count of {one.count}")
         self.space, self.robots, self.slots = space, robots, slots
         self.problem = problem = Problem(f"fixed lag of {slots} keyframes")
         self.pose: Variable = problem.variables(POSE, space, slots * robots)
@@ -130,13 +133,12 @@ class TeamWindow:
         places = self.places[name]
         kind, count = places.kind, (self.slots - places.first) * places.per_slot
         frame = np.repeat(np.arange(places.first, self.slots), places.per_slot)
-        rows = np.tile(np.repeat(places.combinations, kind.capacity, axis=0), (self.slots - places.first, 1))
-        at = dict(zip(places.axes, rows.T, strict=True))
+        one = np.repeat(np.arange(len(places.combinations)), kind.capacity)
+        at = places.owners(np.tile(one, self.slots - places.first))
         on = []
         for role in kind.on:
             if role in (POSE, BEFORE, OTHER):
-                robot = at[POSE] if role == BEFORE else at[role]
-                on.append(self.pose[(frame - (role == BEFORE)) * self.robots + robot])
+                on.append(self.pose[(frame - (role == BEFORE)) * self.robots + at[role]])
             else:
                 on.append(self.lasting[role][at[role]])
         empty = np.full(count, np.nan)

@@ -313,6 +313,21 @@ def test_fences_hold_on_the_whole_window(rng: np.random.Generator) -> None:
     assert stuck.status == "infeasible" and stuck.infeasible == ("fence",)
 
 
+def test_poses_stay_inside_a_fence(rng: np.random.Generator) -> None:
+    """Poses in the plane, where the window is nonlinear; the fence cuts off the outermost part of the drive."""
+    truth, given = drive(rng, 40)
+    edge = truth[:, 0].max() - 0.1
+    fence = {"fence": Fence(lambda pose: pose.translation[0], upper=edge)}
+    smoother, free = driver(4, fences=fence, iterations=5), driver(4, iterations=5)
+    outside = 0
+    for readings in given:
+        estimate = smoother.step(readings)
+        assert estimate.status == "solved"
+        assert estimate.window[:, 0, 0].max() <= edge + 1e-6
+        outside += free.step(readings).state[0, 0] > edge
+    assert outside > 3
+
+
 def test_poses_in_space(rng: np.random.Generator) -> None:
     kinds = {
         "odometry": Kind(meas_3d.relative_pose, ("before", "pose"), (7,), Gaussian(sigma=[0.1] * 3 + [0.02] * 3)),
