@@ -154,7 +154,9 @@ class StackedNetwork(ABC):
         if np.isinf(y).any():
             raise DataError(f"measurements: an infinite value at time step {self._instant + 1}; a missing one is NaN")
         self._advance(y, self._input(inputs))
-        status, infeasible = np.full((self.network.count, self.trials), Status.SOLVED, dtype=object), []
+        status = np.empty((self.network.count, self.trials), dtype=object)
+        status[...] = Status.SOLVED  # numpy.full would turn it into a plain string
+        infeasible: list[TrialInfeasibility] = []
         spent, violated = 0.0, 0
         if self._instant:
             spent, violated = self._solve(status, infeasible)

@@ -1,6 +1,7 @@
 """Moving horizon estimation with measurements relayed over l hops and fused arrival costs (dmhe-l-step)."""
 
 from mhe.relay.design import RelayDesign
+from mhe.relay.engine import RelayNetwork, run_relay_trials
 from mhe.relay.network import RelayEstimator
 from mhe.relay.node import RelayEstimate, RelayNode
 from mhe.relay.options import RELAY_METHODS, RelayOptions, relay_options_of
@@ -14,6 +15,7 @@ __all__ = [
     "RelayDesign",
     "RelayEstimate",
     "RelayEstimator",
+    "RelayNetwork",
     "RelayNode",
     "RelayOptions",
     "RelayReport",
@@ -22,4 +24,5 @@ __all__ = [
     "held",
     "reach",
     "relay_options_of",
+    "run_relay_trials",
 ]

@@ -43,8 +43,8 @@ class BatchSolution:
     def __init__(self, layout: Layout, point: np.ndarray, method: str) -> None:
         self._layout, self.point = layout, point
         entries = point.shape[0]
-        self.status = np.full(entries, Status.SOLVED, dtype=object)
-        self.method = np.full(entries, method, dtype=object)
+        self.status, self.method = np.empty(entries, dtype=object), np.empty(entries, dtype=object)
+        self.status[:], self.method[:] = Status.SOLVED, method  # numpy.full would turn the status into a plain string
         self.iterations = np.zeros(entries, dtype=int)
         self.messages: dict[int, str] = {}
         self.seconds: dict[str, float] = {}
