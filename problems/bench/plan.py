@@ -30,6 +30,7 @@ class Study(pydantic.BaseModel):
         methods: the scenario's methods to run; none given means all.
         solvers: solver names; each method that takes a solver runs with each of them.
         settings: value by name; a list of values is a sweep, so a value that is a list stands in a list.
+        trials: at most this many of the plan's trials, for a scenario that takes long.
     """
 
     model_config = pydantic.ConfigDict(extra="forbid")
@@ -38,6 +39,7 @@ class Study(pydantic.BaseModel):
     methods: tuple[str, ...] = ()
     solvers: tuple[str, ...] = (AUTO,)
     settings: dict[str, Any] = {}
+    trials: int | None = pydantic.Field(default=None, ge=1)
 
     def combinations(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
         """Each (method, solver, complete settings) of the study.
@@ -85,10 +87,12 @@ class Plan(pydantic.BaseModel):
     def jobs(self) -> list[Job]:
         """Everything to run, once each, trial by trial: an interrupted campaign has whole trials to compare."""
         found: dict[str, Job] = {}
-        combinations = [(study.scenario, *found) for study in self.study for found in study.combinations()]
+        combinations = [(study, *found) for study in self.study for found in study.combinations()]
         for trial in range(self.trials):
-            for scenario, method, solver, settings in combinations:
-                job = Job(scenario, method, solver, settings, self.seed, trial)
+            for study, method, solver, settings in combinations:
+                if study.trials is not None and trial >= study.trials:
+                    continue
+                job = Job(study.scenario, method, solver, settings, self.seed, trial)
                 found.setdefault(job.key, job)
         return list(found.values())
 

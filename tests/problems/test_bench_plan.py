@@ -48,6 +48,15 @@ def test_a_plan_is_the_product_of_what_it_names() -> None:
     assert jobs[0].settings["steps"] == 4  # complete: defaults are in
 
 
+def test_a_study_can_take_fewer_trials_than_its_plan() -> None:
+    few = Study(scenario="toy", methods=("mean",), trials=2)
+    jobs = Plan(study=(few, Study(scenario="other")), trials=3).jobs()
+    assert [(job.scenario, job.trial) for job in jobs] == [
+        ("toy", 0), ("other", 0), ("toy", 1), ("other", 1), ("other", 2)
+    ]  # fmt: skip
+    assert len(Plan(study=(few,), trials=1).jobs()) == 1
+
+
 def test_equal_jobs_are_run_once_and_keys_do_not_depend_on_order() -> None:
     study = Study(scenario="toy", methods=("mean",), settings={"tolerance": [1e-6, "1e-6"], "steps": 4})
     swapped = Study(scenario="toy", methods=("mean",), settings={"steps": "4"})
