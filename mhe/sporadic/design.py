@@ -12,21 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from mhe.observers import kalman_gain
 from mhe.polyhedron import Polyhedron
 from mhe.sporadic.blocks import Blocks, blocks_of
+from mhe.sporadic.gains import (
+    BySensor,
+    blended_gains,
+    check_observer,
+    given_gains,
+    kalman_gains,
+    part_seen,
+    sensor_output,
+    sensor_size,
+)
 from mhe.sporadic.options import SporadicOptions, options_of
 from mhe.sporadic.plan import SporadicPlan
 from mhe.sporadic.pool import DetectionPool
 from mhe.sporadic.readings import Reading
 from mhe.sporadic.rows import half_planes, require_bounded
 from mhe.sporadic.window import WindowShape
-from problems.errors import DefinitionError, ModelWarning, SettingError, ShapeError, UnstableError
+from problems.errors import DefinitionError, ModelWarning, SettingError, ShapeError
 from problems.models import LinearModel, Model
 from problems.networks import Network, Weights, given_weights, metropolis_weights, uniform_weights
-from problems.networks.observability import observability_rank
 
-Gains = Sequence[Any] | float | None
+Gains = Sequence[Any] | Mapping[Hashable, Any] | float | None
 
 
 class SporadicDesign:
@@ -41,6 +49,9 @@ class SporadicDesign:
             (the first node has the first ones).
         fields: convex set of the outputs of each node's sensors, by label, or one entry per node in their order; None
             where a node has none.
+        convex_pieces: of each node's set, in the same forms, for ``pieces="detected"`` or ``"both"``.
+        unseen_pieces: convex pieces of where a vehicle is that nobody of a node's neighbourhood sees, in the same
+            forms, for ``pieces="unseen"`` or ``"both"``.
         weight_matrix: (count, count) K for the weights ``given``.
         gains: observer gains: a number l for ``L = l A C^+`` of each sensor (shared among the sensors of a part where
             the observer is regional), one array L^i per node, (n, own components) or, regional, (n, components of the
@@ -72,6 +83,8 @@ class SporadicDesign:
         *,
         placement: Sequence[Hashable] | None = None,
         fields: Mapping[Hashable, Polyhedron] | Sequence[Polyhedron | None] | None = None,
+        convex_pieces: Mapping[Hashable, Sequence[Polyhedron]] | Sequence[Sequence[Polyhedron] | None] | None = None,
+        unseen_pieces: Mapping[Hashable, Sequence[Polyhedron]] | Sequence[Sequence[Polyhedron] | None] | None = None,
         weight_matrix: Any = None,
         gains: Gains = None,
         require_sound: bool = True,
@@ -94,6 +107,8 @@ class SporadicDesign:
             np.concatenate([self.own_sensors[j] for j in network.in_neighborhood(i)]) for i in range(network.count)
         ]
         self.fields = self._fields(fields)
+        self.convex_pieces = self._cells(convex_pieces, "convex_pieces", ("detected", "both"))
+        self.unseen_pieces = self._cells(unseen_pieces, "unseen_pieces", ("unseen", "both"))
         self.blocks: Blocks = blocks_of(model)
         self._gains = self._observer(gains, require_sound)
         self.weights = self._weights(weight_matrix)
@@ -116,134 +131,75 @@ class SporadicDesign:
         return tuple(np.flatnonzero(nodes == node) for node in range(count))
 
     def _fields(self, fields: Any) -> tuple[Polyhedron | None, ...]:
-        network = self.network
         if fields is None:
             if self.options.rows != "none":
                 raise SettingError(f"rows={self.options.rows!r} need fields=, the convex set of each node's sensors")
-            return (None,) * network.count
-        if isinstance(fields, Mapping):
-            found: list[Polyhedron | None] = [None] * network.count
-            for label, polyhedron in fields.items():
-                found[network.index(label)] = polyhedron
-        else:
-            found = list(fields)
-        if len(found) != network.count:
-            raise ShapeError(f"fields: expected one entry for each of {network.count} nodes, got {len(found)}")
+            return (None,) * self.network.count
+        found = self._each(fields, "fields")
         for node, polyhedron in enumerate(found):
-            if polyhedron is None:
-                continue
-            for sensor in self.own_sensors[node]:
-                size = self._size(sensor)
-                if polyhedron.size != size:
-                    raise ShapeError(
-                        f"fields: the set of node {network.names([node])} is on {polyhedron.size} component(s), its "
-                        f"sensor {self.model.sensors[sensor].name!r} has {size}"
-                    )
-            require_bounded(polyhedron, f"node {network.names([node])}")
+            if polyhedron is not None:
+                self._check_set(node, polyhedron, "fields")
+                require_bounded(polyhedron, f"node {self.network.names([node])}")
         return tuple(found)
 
-    def _size(self, sensor: int) -> int:
-        rows = self.model.rows(self.model.sensors[sensor].name)
-        return len(range(self.model.measurement_size)[rows])
+    def _cells(self, given: Any, what: str, rules: tuple[str, ...]) -> tuple[tuple[Polyhedron, ...], ...]:
+        """Pieces by node; none where the options do not use them."""
+        if self.options.pieces not in rules:
+            return ((),) * self.network.count
+        if given is None:
+            raise SettingError(f"pieces={self.options.pieces!r} need {what}=, convex sets for each node")
+        found = tuple(tuple(entry or ()) for entry in self._each(given, what))
+        for node, entries in enumerate(found):
+            for polyhedron in entries:
+                self._check_set(node, polyhedron, what)
+        return found
 
-    def _output(self, sensor: int) -> tuple[np.ndarray, np.ndarray]:
-        """C (p, n) and R (p, p) of a sensor."""
-        rows = self.model.rows(self.model.sensors[sensor].name)
-        return self.model.C[rows], self.model.R[rows, rows]
+    def _each(self, given: Any, what: str) -> list[Any]:
+        """One entry per node from a mapping by label or a sequence."""
+        network = self.network
+        if isinstance(given, Mapping):
+            found: list[Any] = [None] * network.count
+            for label, entry in given.items():
+                found[network.index(label)] = entry
+        else:
+            found = list(given)
+        if len(found) != network.count:
+            raise ShapeError(f"{what}: expected one entry for each of {network.count} nodes, got {len(found)}")
+        return found
 
-    # Observer
+    def _check_set(self, node: int, polyhedron: Polyhedron, what: str) -> None:
+        for sensor in self.own_sensors[node]:
+            size = sensor_size(self.model, sensor)
+            if polyhedron.size != size:
+                raise ShapeError(
+                    f"{what}: a set of node {self.network.names([node])} is on {polyhedron.size} component(s), its "
+                    f"sensor {self.model.sensors[sensor].name!r} has {size}"
+                )
 
-    def _observer(self, gains: Gains, require_sound: bool) -> list[dict[int, np.ndarray]] | None:
+    def _observer(self, gains: Gains, require_sound: bool) -> list[BySensor] | None:
         """Per node, the gain (n, p) of every sensor that feeds its observer."""
         if self.options.disturbance != "observer":
             if gains is not None:
                 raise SettingError("gains= belong to disturbance='observer'; with process noise leave them out")
             return None
+        model, labels = self.model, [self.network.names([node]) for node in range(self.network.count)]
         feeding = self.own_sensors if self.options.observer == "local" else self._regions
         if gains is None:
-            rule = self._kalman
-        elif np.ndim(gains) == 0:
-            rule = self._blended
+            found = [kalman_gains(model, self.blocks, sensors) for sensors in feeding]
+        elif isinstance(gains, (int, float)):
+            found = [blended_gains(model, self.blocks, sensors, float(gains)) for sensors in feeding]
         else:
-            rule = None
-        found: list[dict[int, np.ndarray]] = []
-        if rule is None:
-            if len(gains) != self.network.count:  # type: ignore[arg-type]
-                raise ShapeError(f"gains: expected one for each of {self.network.count} nodes")
-            for node, sensors in enumerate(feeding):
-                found.append(self._given(node, sensors, gains[node]))  # type: ignore[index]
-            pairs = [pair for by_sensor in found for pair in by_sensor.items()]
-            self.blocks = blocks_of(self.model, pairs)
-        else:
-            found = [rule(sensors, gains) for sensors in feeding]
-        for node, by_sensor in enumerate(found):
-            self._check_observer(node, by_sensor, require_sound)
+            given = zip(feeding, self._each(gains, "gains"), labels, strict=True)
+            found = [given_gains(model, sensors, gain, label) for sensors, gain, label in given]
+            self.blocks = blocks_of(model, [pair for by_sensor in found for pair in by_sensor.items()])
+        for by_sensor, label in zip(found, labels, strict=True):
+            check_observer(model, self.blocks, by_sensor, label, require_sound=require_sound)
         return found
 
-    def _given(self, node: int, sensors: np.ndarray, gain: Any) -> dict[int, np.ndarray]:
-        sizes = [self._size(s) for s in sensors]
-        array = np.asarray(gain, dtype=float)
-        if array.shape != (self.model.state_size, sum(sizes)) or not np.isfinite(array).all():
-            raise ShapeError(
-                f"node {self.network.names([node])}: expected a finite gain of shape "
-                f"{(self.model.state_size, sum(sizes))}, got {array.shape}"
-            )
-        ends = np.cumsum([0, *sizes])
-        return {int(s): array[:, a:b] for s, a, b in zip(sensors, ends, ends[1:], strict=False)}
-
-    def _blended(self, sensors: np.ndarray, share: Any) -> dict[int, np.ndarray]:
-        parts = [self._part(s) for s in sensors]
-        out = {}
-        for sensor, part in zip(sensors, parts, strict=True):
-            C, _ = self._output(sensor)
-            out[int(sensor)] = float(share) / parts.count(part) * self.model.A @ np.linalg.pinv(C)
-        return out
-
-    def _kalman(self, sensors: np.ndarray, _: Any) -> dict[int, np.ndarray]:
-        """Part by part, so that rounding couples none."""
-        n, out = self.model.state_size, {int(s): np.zeros((self.model.state_size, self._size(s))) for s in sensors}
-        for part in sorted({self._part(s) for s in sensors}):
-            own = [int(s) for s in sensors if self._part(s) == part]
-            states = self.blocks.states[part]
-            A, Q = (matrix[np.ix_(states, states)] for matrix in (self.model.A, self.model.process_covariance))
-            outputs = [self._output(s) for s in own]
-            R = np.zeros((sum(len(r) for _, r in outputs),) * 2)
-            ends = np.cumsum([0, *(len(r) for _, r in outputs)]).tolist()
-            for (_, r), a, b in zip(outputs, ends, ends[1:], strict=False):
-                R[a:b, a:b] = r
-            gain = np.zeros((n, len(R)))
-            gain[states] = kalman_gain(A, np.vstack([C[:, states] for C, _ in outputs]), Q, R).gain
-            for s, a, b in zip(own, ends, ends[1:], strict=False):
-                out[s] = gain[:, a:b]
-        return out
-
-    def _check_observer(self, node: int, by_sensor: dict[int, np.ndarray], require_sound: bool) -> None:
-        """Section 5: A - L C with all detections, and with any single one, lets no observed error grow."""
-        alone = [[sensor] for sensor in by_sensor]
-        for sensors in (list(by_sensor), *(alone if len(alone) > 1 else ())):
-            for part, states in enumerate(self.blocks.states):
-                seeing = [s for s in sensors if self._part(s) == part]
-                if not seeing:
-                    continue
-                A = self.model.A[np.ix_(states, states)]
-                C = np.vstack([self._output(s)[0][:, states] for s in seeing])
-                L = np.hstack([by_sensor[s][states] for s in seeing])
-                radius = float(np.abs(np.linalg.eigvals(A - L @ C)).max())
-                if radius < 1 or observability_rank(A, C, len(A)) < len(A):
-                    continue
-                names = [self.model.sensors[s].name for s in seeing]
-                text = (
-                    f"the observer of node {self.network.names([node])} has spectral radius {radius:.6g} when "
-                    f"{', '.join(names[:3])} detect, although these observe everything; choose smaller or Kalman gains"
-                )
-                if require_sound:
-                    raise UnstableError(text)
-                warnings.warn(text, ModelWarning, stacklevel=4)
-
-    def _part(self, sensor: int) -> int:
-        """Part of the model that a sensor sees."""
-        column = int(np.flatnonzero((self._output(sensor)[0] != 0).any(axis=0))[0])
-        return int(np.flatnonzero((self.blocks.states == column).any(axis=1))[0])
+    @cached_property
+    def _parts(self) -> list[int]:
+        """Part of the model that each sensor sees."""
+        return [part_seen(self.model, self.blocks, s) for s in range(len(self.model.sensors))]
 
     # Weights
 
@@ -314,7 +270,7 @@ class SporadicDesign:
         gain = model.G[blocks.states[:, :, None], blocks.disturbances[:, None, :]]
         noise = model.Q[blocks.disturbances[:, :, None], blocks.disturbances[:, None, :]]
         common = {
-            "width": max((self._size(s) for s in range(len(model.sensors))), default=0),
+            "width": max((sensor_size(self.model, s) for s in range(len(model.sensors))), default=0),
             "blocks": blocks,
             "transition": blocks.of(model.A),
             "disturbance": blocks.of(model.process_covariance),
@@ -342,21 +298,22 @@ class SporadicDesign:
 
     def _row_sizes(self) -> tuple[int, int]:
         """Most sets of rows on a part and most rows of a set, over all nodes."""
-        sets = rows = 0
+        sets, rows = 0, 0
         for node in range(self.network.count):
-            parts = [self._part(s) for s in self._row_owner(node)]
+            parts = [self._parts[s] for s in self._row_owner(node)]
             sets = max([sets, *(parts.count(part) for part in parts)])
-        for polyhedron in self.fields:
-            if polyhedron is not None and sets:
-                rows = max(rows, len(half_planes(polyhedron)[0]))
+        if sets:
+            known = [polyhedron for polyhedron in self.fields if polyhedron is not None]
+            known += [piece for entries in (*self.convex_pieces, *self.unseen_pieces) for piece in entries]
+            rows = max(len(half_planes(polyhedron)[0]) for polyhedron in known)
         return sets, rows
 
     def _plan(self, node: int, sets: int, common: dict[str, Any]) -> SporadicPlan:
         members, region = self.network.in_neighborhood(node), self._regions[node]
         ends = np.cumsum([0, *(self.own_sensors[j].size for j in members)]).tolist()
-        parts = np.array([self._part(s) for s in region], dtype=np.intp)
+        parts = np.array([self._parts[s] for s in region], dtype=np.intp)
         states = self.blocks.states
-        outputs = [self._output(s) for s in region]
+        outputs = [sensor_output(self.model, s) for s in region]
         gains = None
         if self._gains is not None:
             known = self._gains[node]
@@ -374,12 +331,14 @@ class SporadicDesign:
             members=tuple(members.tolist()),
             member_sensors=tuple(slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)),
             names=tuple(self.model.sensors[s].name for s in region),
-            sizes=tuple(self._size(s) for s in region),
+            sizes=tuple(sensor_size(self.model, s) for s in region),
             parts=parts,
             outputs=tuple(C[:, states[v]] for (C, _), v in zip(outputs, parts, strict=True)),
             precisions=tuple(np.linalg.inv(R) for _, R in outputs),
             gains=gains,
             sets=self._sets_at(node),
+            pieces=tuple(self.convex_pieces[node] if s in self.own_sensors[node] else () for s in region),
+            unseen_pieces=self.unseen_pieces[node],
             row_sensors=row_sensors,
             weights=None if self.weights is None else self.weights.row(node).copy(),
             listeners=None if self.options.weight_fusion == "convex" else self._listeners[members].astype(float),

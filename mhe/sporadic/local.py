@@ -9,10 +9,11 @@ import numpy as np
 
 from mhe.distributed.fallback import SOLVED, STOPPED
 from mhe.sporadic.numbers import RegionNumbers
+from mhe.sporadic.pieces import PieceSearch
 from mhe.sporadic.plan import SporadicPlan
 from mhe.sporadic.pool import DetectionPool
 from mhe.sporadic.readings import Slots
-from mhe.sporadic.rows import half_planes
+from mhe.sporadic.rows import padded_rows
 from problems.forms.layout import INFINITE
 from problems.solvers.base import Status
 from problems.solvers.session import Session
@@ -39,6 +40,9 @@ class LocalProblem:
             self._session.update(**self._rows)
         self._row_sensors = plan.row_sensors.ravel()
         self._makes_rows = (self._row_sensors >= 0).astype(float)
+        self._pieces = None
+        if plan.unseen_pieces or any(plan.pieces):
+            self._pieces = PieceSearch(plan, self._session, self._rows)
 
     def solve(
         self, slots: Slots, reference: np.ndarray, information: np.ndarray, predict: Callable[[], np.ndarray]
@@ -69,7 +73,10 @@ class LocalProblem:
         if status in SOLVED or (status in STOPPED and solution.iterations):
             if plan.options.rows == "soft" and status in SOLVED and solution.method != "linear" and self._too_dear():
                 return self._soft(data, predict)
-            return solution["x"].reshape(self._shape), status, ()
+            if self._pieces is None or active is None or status is not Status.SOLVED:
+                return solution["x"].reshape(self._shape), status, ()
+            solution, unmet = self._pieces.refine(solution, flags, active, slots.newest)
+            return solution["x"].reshape(self._shape), Status.INFEASIBLE if unmet else solution.status, unmet
         if status is not Status.INFEASIBLE:
             return predict(), Status.FAILED if status in STOPPED else status, ()
         if plan.options.rows == "soft" or plan.options.unmet == "soft":
@@ -111,9 +118,7 @@ def row_data(plan: SporadicPlan) -> dict[str, np.ndarray]:
         sensor = plan.row_sensors[tuple(place)]
         polyhedron = plan.sets[sensor]
         assert polyhedron is not None
-        G, bound = half_planes(polyhedron)
-        H[(*place, slice(len(G)))] = G @ plan.outputs[sensor]
-        h[(*place, slice(len(G)))] = bound
+        H[tuple(place)], h[tuple(place)] = padded_rows(polyhedron, plan.outputs[sensor], shape.rows)
     slots = shape.horizon + 1
     return {
         "row matrix": np.tile(H.reshape(-1, shape.rows, shape.size), (slots, 1, 1)),

@@ -19,6 +19,7 @@ DetectionWeights = Literal["rank", "uniform", "metropolis", "given"]
 DetectionPrior = Literal["seed", "filter"]
 RowRule = Literal["none", "hard", "soft", "projected"]
 RowScope = Literal["own", "regional"]
+PieceRule = Literal["none", "detected", "unseen", "both"]
 InfeasibleRows = Literal["soft", "predict"]
 
 
@@ -43,6 +44,9 @@ class SporadicOptions:
         rows: field-of-view rows (4.17): ``none``, ``hard``, ``soft`` (exact penalty), or ``projected``: hard rows and
             an observer fed with readings projected onto them (feasible by construction where A = C = I).
         row_scope: detections that make rows: the node's ``own``, or ``regional`` with the neighbours' sets.
+        pieces: sets that are not convex, as convex pieces given to the design (`mhe.sporadic.pieces`): ``detected``, of
+            the own sensors' sets at every detection; ``unseen``, of where a vehicle is now that nobody of the
+            neighbourhood detects (holds only where detection in view is certain); ``both``; ``none``.
         unmet: where hard rows contradict each other: ``soft`` relaxes them by slacks, ``predict`` moves the last window
             on; the status is infeasible in both cases.
         penalty: price of a slack, per unit of violation.
@@ -68,6 +72,7 @@ class SporadicOptions:
     growth_prior: NetworkGrowthPrior = "own"
     rows: RowRule = "none"
     row_scope: RowScope = "own"
+    pieces: PieceRule = "none"
     unmet: InfeasibleRows = "soft"
     penalty: float = 1e4
     covariance_cap: float = 1e8
@@ -99,6 +104,9 @@ class SporadicOptions:
         if self.rows == "projected" and self.disturbance != "observer":
             raise SettingError("rows='projected' feeds an observer; with process noise use rows='hard' or 'soft'")
 
+        if self.pieces != "none" and self.rows == "none":
+            raise SettingError(f"pieces={self.pieces!r} refine the rows of the sensors' sets; set rows='hard' too")
+
     def as_dict(self) -> dict[str, Any]:
         """All options by name, as the scenarios print them."""
         return asdict(self)
@@ -114,6 +122,7 @@ _CHOICES: dict[str, Any] = {
     "growth_prior": NetworkGrowthPrior,
     "rows": RowRule,
     "row_scope": RowScope,
+    "pieces": PieceRule,
     "unmet": InfeasibleRows,
 }
 

@@ -32,6 +32,8 @@ class SporadicPlan:
         gains: L (m, p) of each sensor of the region on its part, None where it does not feed the observer; None with
             process noise.
         sets: convex set of the output of each sensor, None where the node has none.
+        pieces: convex pieces of that set, for sensors where they count; else empty.
+        unseen_pieces: convex pieces of where a vehicle is that nobody of the region sees; empty where they do not count.
         row_sensors: (parts, sets) sensors that make rows on a part, -1 for none.
         shape: sizes of the window.
         weights: (members,) row of K; None where it follows the detections.
@@ -60,6 +62,8 @@ class SporadicPlan:
     precisions: tuple[np.ndarray, ...]
     gains: tuple[np.ndarray | None, ...] | None
     sets: tuple[Polyhedron | None, ...]
+    pieces: tuple[tuple[Polyhedron, ...], ...]
+    unseen_pieces: tuple[Polyhedron, ...]
     row_sensors: np.ndarray
     shape: WindowShape
     weights: np.ndarray | None

@@ -28,8 +28,8 @@ class WindowRank:
         known: dict[bytes, int] = {}
         for part, A in enumerate(transition):
             kinds: dict[bytes, list[int]] = {}
-            for sensor in np.flatnonzero(parts == part):
-                kinds.setdefault(outputs[sensor].tobytes(), []).append(int(sensor))
+            for sensor in np.flatnonzero(parts == part).tolist():
+                kinds.setdefault(outputs[sensor].tobytes(), []).append(sensor)
             for sensors in kinds.values():
                 column = np.zeros(len(parts))
                 column[sensors] = 1.0

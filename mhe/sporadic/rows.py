@@ -51,6 +51,14 @@ def half_planes(polyhedron: Polyhedron) -> tuple[np.ndarray, np.ndarray]:
     return G, np.concatenate([polyhedron.upper[upper], -polyhedron.lower[lower]])
 
 
+def padded_rows(polyhedron: Polyhedron, output: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """H = G C (rows, m) and h (rows,) of ``G C x <= h``, filled up with rows that say nothing."""
+    G, bound = half_planes(polyhedron)
+    H, h = np.zeros((rows, output.shape[1])), np.full(rows, INFINITE)
+    H[: len(G)], h[: len(G)] = G @ output, bound
+    return H, h
+
+
 def require_bounded(polyhedron: Polyhedron, what: str) -> None:
     """Raises DefinitionError where a set reaches to infinity."""
     from scipy.optimize import linprog

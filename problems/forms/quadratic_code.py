@@ -84,7 +84,8 @@ class QuadraticCode:
     def _compile(self) -> None:
         self._function = ca.Function("assemble", [self._d, self._on], [self._pieces])
         self._values = np.empty(self._pieces.shape[0])
-        self._buffer, self._run = self._function.buffer()
+        pair: Any = self._function.buffer()
+        self._buffer, self._run = pair
         self._buffer.set_res(0, self._values.data)
 
     def _switches(self, rows: list[_Instances]) -> list[np.ndarray]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs  # type: ignore[attr-defined]
 
-from problems.errors import MissingExtraError, SettingError
+from problems.errors import DataError, MissingExtraError, SettingError
 from problems.forms.quadratic import clean
 from problems.forms.quadratic_code import Assembled, QuadraticCode
 from problems.solvers.base import QPResult, Status
@@ -27,6 +27,19 @@ class CodeSession(QPSession):
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
         self.code = QuadraticCode(self.program)
+        self._solved: tuple[Assembled, np.ndarray] | None = None
+
+    @property
+    def value(self) -> float:
+        """Cost of the last solution, up to a constant of the data of the costs; cheap, to compare sets of rows.
+
+        Raises:
+            DataError: nothing was solved.
+        """
+        if self._solved is None:
+            raise DataError("nothing was solved yet")
+        program, v = self._solved
+        return float(v @ (0.5 * (program.P @ v) + program.q))
 
     def _set(self, name: str, value: Any) -> None:
         self.store.set(name, value)
@@ -90,6 +103,7 @@ class CodeSession(QPSession):
         iterations: int = 0,
         message: str = "",
     ) -> Solution:
+        self._solved = program, v
         z = program.Z.dot(v)
         z += program.offset
         return Solution(self.layout, z, status, method, self._check(numbers, flags, z, mu), iterations, message)
