@@ -61,7 +61,7 @@ def draw_team(axes) -> None:
 
 
 def draw_solvers(axes) -> None:
-    """Distance to the optimum against time of the steps of one moving horizon estimator, along a ladder of tolerances."""
+    """Distance to the optimum against time of a step of one moving horizon estimator, for a ladder of tolerances."""
     matrix = [[0.99, 0.2, 0, 0], [-0.1, 0.6, 0, 0], [0, 0, 0.95, 0.2], [0, 0, -0.2, 0.9]]
     sensors = [Sensor("first", [[1.0, 0, 0, 0]], sigma=0.5), Sensor("third", [[0, 0, 1.0, 0]], sigma=0.5)]
     model = LinearModel(matrix, np.diag([0.05, 0.1, 0.05, 0.1]), sensors=sensors, covariance=np.eye(4))
