@@ -33,7 +33,8 @@ class SporadicPlan:
             process noise.
         sets: convex set of the output of each sensor, None where the node has none.
         pieces: convex pieces of that set, for sensors where they count; else empty.
-        unseen_pieces: convex pieces of where a vehicle is that nobody of the region sees; empty where they do not count.
+        unseen_pieces: convex pieces of where a vehicle is that nobody of the region sees; empty where they do
+            not count.
         row_sensors: (parts, sets) sensors that make rows on a part, -1 for none.
         shape: sizes of the window.
         weights: (members,) row of K; None where it follows the detections.

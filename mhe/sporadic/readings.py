@@ -61,14 +61,14 @@ class Sensors:
         if numbers.size != self.size:
             raise ShapeError(f"{what}: expected {self.size} component(s) of {self.count} sensor(s), got {numbers.size}")
         filled = np.append(numbers, 0.0)[self._places]
-        there = ~np.isnan(filled).any(axis=1)
+        there: Any = ~np.isnan(filled).any(axis=1)
         on = there
         if flags is not None:
             given = np.asarray(flags, dtype=float).ravel()
             if given.size != self.count:
                 raise ShapeError(f"{what}: expected one flag for each of {self.count} sensor(s), got {given.size}")
-            on = np.asarray(np.equal(given, 1))
-            if not np.logical_or(on, given == 0).all():
+            on = given == 1
+            if not (on | (given == 0)).all():
                 raise DataError(f"{what}: detection flags are 1 or 0, got {given}")
             if (on & ~there).any():
                 wrong = self.names[int(np.flatnonzero(on & ~there)[0])]
