@@ -18,12 +18,16 @@ from problems.bench.summary import summarize
 from problems.bench.workers import LocalProcesses
 from problems.cli.output import error_console, one_json_object, print_failures, print_summaries
 from problems.cli.progress import progress
-from problems.errors import SettingError
+from problems.errors import SettingError, UnknownNameError
 
 
 def bench(
     what: Annotated[
-        list[str], typer.Argument(metavar="SCENARIO...|PLAN", help="Scenarios, a TOML file, or a built-in plan.")
+        list[str],
+        typer.Argument(
+            metavar="SCENARIO...|PLAN",
+            help=f"Scenarios, a TOML file, or a built-in plan: {', '.join(built_in_plans())}.",
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the results; an interrupted run in it is resumed.")],
     method: Annotated[list[str] | None, typer.Option(help="Method to run, may be repeated; all by default.")] = None,
@@ -62,8 +66,14 @@ def bench(
 
 
 def _plan(what: list[str], methods: list[str], solvers: list[str], values: dict[str, list[str]]) -> Plan:
-    known = registry.names("scenarios")
-    if len(what) == 1 and what[0] not in known and (what[0].endswith(".toml") or what[0] in built_in_plans()):
+    known, plans = registry.names("scenarios"), built_in_plans()
+    if len(what) > 1:
+        for name in what:
+            if name not in known and (name in plans or name.endswith(".toml")):
+                raise SettingError(f"a plan is run alone: {name} with {', '.join(n for n in what if n != name)}")
+    elif what[0] not in known and not what[0].endswith(".toml") and what[0] not in plans:
+        raise UnknownNameError("scenario or plan", what[0], [*known, *plans])
+    elif what[0] not in known:
         if methods or solvers or values:
             raise SettingError(f"--method, --solver and --set go with scenarios; the plan {what[0]} states its own")
         return read_plan(what[0]) if what[0].endswith(".toml") else built_in_plan(what[0])

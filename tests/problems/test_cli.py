@@ -83,7 +83,7 @@ def test_run_prints_the_object_of_the_contract() -> None:
         assert list(row) == ROW_FIELDS
         assert row["settings"] == found["settings"]
         assert row["metrics"]["never"] is None
-        assert row["metrics_se"].keys() == {"error"}
+        assert row["metrics_se"].keys() - {"distance_to_reference"} == {"error"}
         assert list(row["time"]) == ["compile", "setup", "update", "solve", "step_median", "step_p95"]
         assert list(row["status"]) == [status.value for status in Status]
         assert row["status"]["solved"] == 9
@@ -117,6 +117,10 @@ def test_the_reproduce_line_gives_the_row_again(tmp_path: Path) -> None:
         (["bench", "toy", "--out", "/proc/horizonet"], "cannot write to /proc/horizonet"),
         (["bench", "nothing.toml", "--out", "r"], "nothing.toml: expected a plan in TOML"),
         (["bench", "quick", "--method", "mean", "--out", "r"], "states its own"),
+        (["bench", "mhe-solver", "--out", "r"], "did you mean mhe-solvers"),
+        (["bench", "quick", "toy", "--out", "r"], "a plan is run alone: quick with toy"),
+        (["bench", "toy", "other", "--set", "fnce=1", "--out", "r"], "did you mean fence"),
+        (["bench", "toy", "--solver", "swfit", "--out", "r"], "did you mean swift"),
         (["report", "/nonexistent"], "a folder written by horizonet bench"),
         (["halo"], "halo"),
     ],
@@ -139,6 +143,30 @@ def test_failed_trials_end_with_code_1_and_keep_the_others() -> None:
     assert shown.exit_code == 1
     assert "failed: ArithmeticError: the estimate diverged" in shown.stderr
     assert "horizonet run toy --method first --solver auto --set mode=raise --trials 1 --seed 0" in shown.stderr
+
+
+@pytest.mark.serial
+def test_a_pairing_that_does_not_exist_is_told_and_is_no_failure() -> None:
+    shown = horizonet("run", "toy", "--solver", "slow", "--set", "mode=unfit")
+    assert shown.exit_code == 0  # kalman needs no solver
+    assert shown.stderr.count("not possible: FormError: solver 'slow' takes factor graphs only") == 2
+    assert "failed" not in shown.stderr
+    alone = horizonet("run", "toy", "--method", "mean", "--solver", "slow", "--set", "mode=unfit")
+    assert alone.exit_code == 1  # nothing is left
+
+
+@pytest.mark.serial
+def test_a_bench_goes_on_when_an_estimator_raises(tmp_path: Path) -> None:
+    out = str(tmp_path / "r")
+    found = answer("bench", "toy", "--set", "mode=raise,calm", "--trials", "2", "--out", out, "--json", code=1)
+    by = {(row["method"], row["settings"]["mode"]): row for row in found["rows"]}
+    assert by["first", "raise"]["status"]["failed"] == 2
+    assert by["first", "calm"]["metrics"]["error"] > 0
+    html = tmp_path / "report.html"
+    assert horizonet("report", out, "--html", str(html)).exit_code == 0
+    text = html.read_text(encoding="utf-8")
+    assert "the estimate diverged" in text
+    assert "Traceback (most recent call last)" in text
 
 
 @pytest.mark.serial
