@@ -93,7 +93,7 @@ class GraphMethods:
     @staticmethod
     def run(settings: Settings, method: str, solver: str, recording: PoseGraph, prepared: None) -> Outcome:
         del prepared
-        own = {"graduated": True} if settings.graduated else {}
+        own: dict[str, Any] = {"graduated": True} if settings.graduated else {}
         if own and solver not in ("auto", "gauss-newton"):
             raise SettingError(
                 f"graduated is a setting of gauss-newton, not of {solver}; gtsam-gnc does the same with "

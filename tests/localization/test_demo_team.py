@@ -198,10 +198,11 @@ def test_the_picture_shows_team_fixes_estimates_and_ellipses() -> None:
     above, beside = scenario.plot(settings, world, outcomes).axes
     labels = {text.get_text() for text in above.get_legend().get_texts()}
     assert labels == {"range and bearing", "GPS fix", "truth", "ml", "ls", "fence"}
-    curves = [line for line in above.get_lines() if len(line.get_xdata()) == 60]
-    assert len(curves) == 2 * 9  # an ellipse for each robot and method
+    # an ellipse of 60 points and a gap for each robot, one line for each method
+    curves = [np.array(line.get_xydata()) for line in above.get_lines() if len(line.get_xdata()) == 9 * 61]
+    assert len(curves) == 2
     root = outcomes["ml"].trace.covariance[0]
-    around = np.array(curves[0].get_xydata()) - outcomes["ml"].trace.robot[0, :2]
+    around = curves[0][:60] - outcomes["ml"].trace.robot[0, :2]
     distance = np.einsum("ki,ij,kj->k", around, np.linalg.inv(root), around)
     np.testing.assert_allclose(distance, 5.991, rtol=1e-6)
     assert len(beside.get_lines()) == 3
