@@ -53,7 +53,7 @@ def _in_order(results: Results) -> list[Row]:
     def place(row: Row) -> tuple[Any, ...]:
         job, methods = row.job, results.scenarios[row.job.scenario]["methods"]
         values = tuple(
-            (str(type(value)), -value if isinstance(value, float) else value) for value in _plain(job.settings)
+            (str(type(value)), -value if isinstance(value, bool | float) else value) for value in _plain(job.settings)
         )
         solver = solvers.index(job.solver) if job.solver in solvers else -1
         return scenarios.get(job.scenario, -1), methods.index(job.method), solver, values, job.seed, job.trial

@@ -250,7 +250,7 @@ class ScenarioSection:
             ]
             note = (
                 f"Shifted geometric mean (shift {seconds(compare.SHIFT)}) of the solve time of a trial, over the same"
-                f" trials for all. A trial without result, or with more than {compare.UNSOLVED_SHARE:.0%} of its steps"
+                f" trials for all. A trial without result, or with more than {percent(compare.UNSOLVED_SHARE)} of its steps"
                 f" neither solved nor found infeasible, failed and counts as {seconds(limit)}."
             )
             head = ["solver", "geometric mean", "ratio to the fastest", "failed"]
