@@ -128,9 +128,12 @@ class Outputs:
             used[..., rows] = used[..., rows].all(axis=-1, keepdims=True)
         return used
 
-    def informed(self, y: np.ndarray) -> np.ndarray:
-        """``R^-1 y`` (p, trials) of measurements (trials, p), NaN where missing."""
-        return np.asarray(self._information @ np.where(self.used(~np.isnan(y)), y, 0.0).T)
+    def summands(self, y: np.ndarray) -> np.ndarray:
+        """``R^-1 y`` and y (2 p, trials) of measurements (trials, p), NaN where missing, zero where not used."""
+        there = ~np.isnan(y)
+        known = np.where(there, y, 0.0)
+        used = known if not self._whole else np.where(self.used(there), y, 0.0)
+        return np.concatenate([np.asarray(self._information @ used.T), known.T])
 
 
 class Region:
@@ -157,19 +160,23 @@ class Region:
         rows: np.ndarray,
         gains: np.ndarray | None,
     ) -> None:
-        from scipy.sparse import csr_array
+        from scipy.sparse import block_diag, csr_array
 
         n, p = model.state_size, model.measurement_size
         self.A, self._outputs, self.count = model.A, outputs, count
         self._member = csr_array((np.ones(nodes.size), (nodes, rows)), shape=(count, p))
         at = (nodes[:, None] * n + np.arange(n)).ravel(), np.repeat(rows, n)
-        self._C = csr_array((outputs.C[rows].ravel(), at), shape=(count * n, p))
+        C = csr_array((outputs.C[rows].ravel(), at), shape=(count * n, p))
         self._L = None if gains is None else csr_array((gains.ravel(), at), shape=(count * n, p))
+        # one product for both sums
+        self._both = C if self._L is None else csr_array(block_diag([C, self._L], format="csr"))
         self._squares = (outputs.C[:, :, None] * outputs.weighted[:, None]).reshape(p, n * n)
 
-    def heard(self, informed: np.ndarray) -> np.ndarray:
-        """m (count, trials, n) from ``R^-1 y`` (p, trials)."""
-        return self._by_node(self._C @ informed)
+    def sums(self, summands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """m and, where there are gains, e (count, trials, n) from `Outputs.summands`."""
+        found = np.asarray(self._both @ summands[: self._both.shape[1]])
+        ends = self.count * len(self.A)
+        return self._by_node(found[:ends]), self._by_node(found[ends:])
 
     def push(self, y: np.ndarray) -> np.ndarray:
         """e (count, trials, n) from measurements (p, trials), zero where missing."""
@@ -190,7 +197,7 @@ class Region:
 
     @property
     def nbytes(self) -> int:
-        parts = [self._member, self._C, *([] if self._L is None else [self._L])]
+        parts = [self._member, self._both, *([] if self._L is None else [self._L])]
         return sum(part.data.nbytes + part.indices.nbytes + part.indptr.nbytes for part in parts)
 
     def _by_node(self, stacked: Any) -> np.ndarray:
@@ -217,7 +224,8 @@ class Sums:
         count, slots, (p, n) = regions[0].count, len(reach), outputs.C.shape
         self.y = np.full((slots, trials, p), np.nan)
         self.heard = np.zeros((count, trials, slots, n))
-        self.push = np.zeros((count, trials, slots - 1, n)) if observer else None
+        self._push = np.zeros((count, trials, slots, n)) if observer else None
+        self._summands = np.zeros((slots, 2 * p, trials))
         self._known = np.full(slots, -1)  # region that every slot was summed over
         self._complete: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         self._pattern: tuple[bytes, bytes] | None = None
@@ -225,26 +233,25 @@ class Sums:
     def advance(self, y: np.ndarray, newest: int, slid: bool) -> None:
         """Take the measurements (trials, p) of the instant in slot `newest`; `slid`: the oldest instant left."""
         if slid:
-            self.y[:-1] = self.y[1:]
-            self.heard[:, :, :-1] = self.heard[:, :, 1:]
-            if self.push is not None:
-                self.push[:, :, :-1] = self.push[:, :, 1:]
-            self._known[:-1] = self._known[1:]
-        self.y[newest], self._known[newest] = y, -1
+            for array in (self.y, self._summands, self._known):
+                array[:-1] = array[1:]
+            for array in (self.heard, *([] if self._push is None else [self._push])):
+                array[:, :, :-1] = array[:, :, 1:]
+        self.y[newest], self._summands[newest], self._known[newest] = y, self._outputs.summands(y), -1
         for slot in range(newest + 1):
             reach = int(self._reach[newest - slot])
             if reach == self._known[slot]:
                 continue
             self._known[slot] = reach
-            self.heard[:, :, slot] = -self._regions[reach].heard(self._outputs.informed(self.y[slot]))
-            if self.push is not None and slot < newest:
-                self._push(slot, reach)
-        if self.push is not None and newest:  # the instant before the newest now has a transition that leaves it
-            self._push(newest - 1, int(self._known[newest - 1]))
+            heard, push = self._regions[reach].sums(self._summands[slot])
+            np.negative(heard, out=self.heard[:, :, slot])
+            if self._push is not None:
+                self._push[:, :, slot] = push
 
-    def _push(self, slot: int, reach: int) -> None:
-        assert self.push is not None
-        self.push[:, :, slot] = self._regions[reach].push(np.nan_to_num(self.y[slot]).T)
+    @property
+    def push(self) -> np.ndarray | None:
+        """e of the transitions (count, trials, N, n)."""
+        return None if self._push is None else self._push[:, :, :-1]
 
     def matrices(self) -> dict[str, np.ndarray]:
         """``seen`` and ``transition``, by node or by node and trial, if they changed since the last call."""
@@ -284,5 +291,5 @@ class Sums:
     @property
     def nbytes(self) -> int:
         kept = [part for pair in self._complete.values() for part in pair if part is not None]
-        arrays = [self.y, self.heard, *([] if self.push is None else [self.push]), *kept]
+        arrays = [self.y, self._summands, self.heard, *([] if self._push is None else [self._push]), *kept]
         return sum(array.nbytes for array in arrays) + sum(region.nbytes for region in self._regions)

@@ -103,7 +103,8 @@ class RelayNetwork(StackedNetwork):
         predicted = first @ model.A.T + self._u[:, 1] @ model.B.T
         if options.disturbance == "observer":
             seen = np.einsum("ptn,pn->pt", first[self._owners], model.C)
-            predicted += self._own.push(np.nan_to_num(self._sums.y[0].T - seen))
+            innovation = self._sums.y[0].T - seen
+            predicted += self._own.push(np.where(np.isnan(innovation), 0.0, innovation))
         self._published = predicted
 
     def _more(self) -> dict[str, Any]:

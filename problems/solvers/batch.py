@@ -384,7 +384,7 @@ class Applied:
         else:
             same = known == len(blocks) and (np.diff(blocks) == 1).all()
             self._T = maps.T if same else maps.T[blocks]
-            self._t = (maps.t if same else maps.t[blocks])[:, None]
+            self._t = (maps.t if same else maps.t[blocks])[:, None] if maps.t.any() else None
         self.definite = maps.definite[sets]
 
     @property
@@ -400,9 +400,11 @@ class Applied:
             for k, entries in enumerate(self._entries):
                 point[entries] = data[entries] @ maps.T[k].T + maps.t[k]
         else:
-            out = data.reshape(len(self._T), self._per, -1) @ self._T.transpose(0, 2, 1)
-            out += self._t
-            point[...] = out.reshape(point.shape)
+            shape = len(self._T), self._per, -1
+            out = point.reshape(shape)
+            np.matmul(data.reshape(shape), self._T.transpose(0, 2, 1), out=out)
+            if self._t is not None:
+                out += self._t
         rows = maps.rows
         if rows is None or not rows.count:
             return np.zeros(0, np.intp)

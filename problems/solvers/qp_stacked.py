@@ -17,6 +17,7 @@ from problems.forms.layout import INFINITE, TermLayout
 from problems.forms.quadratic import QuadraticProgram, clean
 from problems.noise import information_matrix
 from problems.problem import DataSlot
+from problems.solvers.linear import FREE
 from problems.solvers.qp_maps import INDEPENDENT
 
 CHUNK_NUMBERS = 4_000_000  # of temporary arrays, roughly
@@ -332,14 +333,18 @@ def _flat(rows: np.ndarray) -> np.ndarray:
 def _factors(P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """P with what is not definite replaced by the identity, Cholesky factors, and which sets are definite."""
     definite = np.full(len(P), True)
+    diagonal = np.einsum("sii->si", P)
     try:
         L = np.linalg.cholesky(P)
+        doubtful = np.flatnonzero((np.einsum("sii->si", L) ** 2 <= INDEPENDENT * diagonal).any(axis=1))
     except np.linalg.LinAlgError:
-        diagonal = np.einsum("sii->si", P)
-        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-        smallest = np.linalg.eigvalsh(P * scale[:, :, None] * scale[:, None])[:, 0]
-        definite = smallest > INDEPENDENT
-        P = np.where(definite[:, None, None], P, np.eye(P.shape[-1]))
-        L = np.linalg.cholesky(P)
-    left = np.einsum("sii->si", L) ** 2 > INDEPENDENT * np.einsum("sii->si", P)
-    return P, L, definite & left.all(axis=1)
+        L, doubtful = None, np.arange(len(P))
+    if doubtful.size:  # the scale-free test of `DenseMap`
+        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))[doubtful]
+        smallest = np.linalg.eigvalsh(P[doubtful] * scale[:, :, None] * scale[:, None])[:, 0]
+        definite[doubtful] = smallest > FREE
+        if L is None or not definite.all():
+            P = np.where(definite[:, None, None], P, np.eye(P.shape[-1]))
+            L = np.linalg.cholesky(P)
+    assert L is not None
+    return P, L, definite
