@@ -6,7 +6,7 @@ problem in fewer unknowns (windows F1, F2, F3, P1, P2 of the spec ``dmhe-pre-est
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -135,6 +135,28 @@ class Reduced:
                 P, Q, q0 = P + more[0], Q + more[1], q0 + more[2]
         return P, Q, q0
 
+    def gradient(
+        self, store: DataStore, flags: dict[str, np.ndarray | None]
+    ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """Gradient of the costs at (v, data), each (n,) or a matrix of columns, for the weights of `store`.
+
+        It comes from the rows and not from P: where weights differ much, P has lost the digits of the small ones.
+        """
+        parts = []
+        for term in self.costs:
+            rows, on = term.rows, flags.get(term.name)
+            WR = weigh(rows, information_of(rows, store, on)).T
+            zero = np.zeros((self.size, rows.E.shape[1])) if self.dense else sp.csr_array((self.size, rows.E.shape[1]))
+            parts.append((WR, rows, *_linear(term, on, zero, np.zeros(self.size))))
+
+        def gradient(v: np.ndarray, d: np.ndarray) -> np.ndarray:
+            down = (slice(None), *[None] * (d.ndim - 1))
+            return sum(
+                (WR @ (r.R @ v + r.E @ d + r.c[down]) + (Q @ d + q0[down]) for WR, r, Q, q0 in parts), np.zeros(v.shape)
+            )
+
+        return gradient
+
     def bounds(self, numbers: np.ndarray, flags: dict[str, np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the rows ``A v`` for given data."""
         shift = self.E @ numbers + self.c
@@ -181,18 +203,19 @@ def _cost(rows: Rows, map_: AffineMap) -> CostTerm:
 
 def _contribution(term: CostTerm, store: DataStore, on: np.ndarray | None) -> tuple[Matrix, Matrix, np.ndarray]:
     rows = term.rows
-    R = rows.R
     WR = weigh(rows, information_of(rows, store, on)).T
-    P, Q, q0 = WR @ R, WR @ rows.E, WR @ rows.c
-    if term.linear is not None or term.linear_data is not None:
-        if on is not None:
-            keep = np.repeat(on, rows.dim).astype(float)
-            R = R * keep[:, None] if isinstance(R, np.ndarray) else sp.diags_array(keep) @ R
-        if term.linear is not None:
-            q0 = q0 + R.T @ term.linear
-        else:
-            Q = Q + R.T @ term.linear_data
-    return P, Q, q0
+    return WR @ rows.R, *_linear(term, on, WR @ rows.E, WR @ rows.c)
+
+
+def _linear(term: CostTerm, on: np.ndarray | None, Q: Matrix, q0: np.ndarray) -> tuple[Matrix, np.ndarray]:
+    """Q and q0 with the linear part of the cost."""
+    if term.linear is None and term.linear_data is None:
+        return Q, q0
+    R = term.rows.R
+    if on is not None:
+        keep = np.repeat(on, term.rows.dim).astype(float)
+        R = R * keep[:, None] if isinstance(R, np.ndarray) else sp.diags_array(keep) @ R
+    return (Q, q0 + R.T @ term.linear) if term.linear is not None else (Q + R.T @ term.linear_data, q0)
 
 
 def _sum(parts: list[Any], size: int, data: int, dense: bool) -> tuple[Matrix, Matrix, np.ndarray]:

@@ -16,8 +16,10 @@ FREE = 1e-12  # eigenvalue of a Hessian scaled to unit diagonal, below which a d
 SHIFT = 1e-10  # added to a scaled singular system to find its free direction
 
 
-def factorized_kkt(P: Any, A: Any) -> tuple[Callable[[np.ndarray], np.ndarray] | None, np.ndarray | None]:
+def factorized_kkt(P: Any, A: Any) -> tuple[Callable[[np.ndarray], np.ndarray] | None, np.ndarray | None, float]:
     """Solver of ``[P A'; A 0]`` (sparse) for one or several right sides, or a direction of ``A d = 0`` that P misses.
+
+    Last comes an estimate of the smallest eigenvalue of P on ``A d = 0``, scaled to unit diagonal.
 
     The direction comes from inverse iteration on the system scaled to unit diagonal. Rows of A may repeat.
     """
@@ -42,8 +44,8 @@ def factorized_kkt(P: Any, A: Any) -> tuple[Callable[[np.ndarray], np.ndarray] |
         growth = np.linalg.norm(direction)
         direction = direction / max(growth, 1e-300)
     if factor is None or not growth < 1 / FREE:
-        return None, scale[:n] * direction
-    return lambda right: (scale * factor.solve((scale * right.T).T).T).T, None
+        return None, scale[:n] * direction, 0.0
+    return lambda right: (scale * factor.solve((scale * right.T).T).T).T, None, float(1 / max(growth, 1e-300))
 
 
 def _symmetric_lu(system: Any, indefinite: bool) -> Any:
@@ -59,7 +61,7 @@ def covariance_blocks(layout: Layout, hessian: Any, equalities: Any, columns: np
     Raises:
         UnobservableError: a direction is free; names its variables.
     """
-    solve, free = factorized_kkt(hessian, equalities)
+    solve, free, _ = factorized_kkt(hessian, equalities)
     if solve is None:
         assert free is not None
         raise UnobservableError(

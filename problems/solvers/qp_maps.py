@@ -1,11 +1,14 @@
 """The answer of a quadratic program while no inequality is active: one affine map of the vector data.
 
 ``[z; rows - upper; lower - rows] = T d + t`` gives all unknowns and all row violations by one product. `DenseMap` holds
-T; `SparseMap` (large problems) keeps the factorized KKT system instead.
+T; `SparseMap` (large problems) keeps the factorized KKT system instead. Where weights differ so much that the Hessian
+has lost digits of the small ones, the answer is refined: steps by the gradient that the rows of the costs give at it,
+as iterations of Gauss-Newton would.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +23,8 @@ from problems.solvers.linear import FREE, factorized_kkt
 if TYPE_CHECKING:
     from problems.solvers.qp_rows import StackedRows
 
+WEAK = 1e-6  # the same share, or an eigenvalue of the scaled Hessian, below which answers are refined
+REFINEMENTS = 2
 INDEPENDENT = 1e-13  # share of a Hessian diagonal left after elimination, below which a direction may be free
 
 Vectors = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -41,6 +46,7 @@ class DenseMap:
         self.reduced, self.flags = reduced, flags
         self.rows: StackedRows | None = None
         self._vectors: _Vectors | None = None
+        self._refine: _Refinement | None = None
         self.size = program.layout.size
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
         inner = reduced.inner
@@ -50,7 +56,7 @@ class DenseMap:
             NP = inner.Z.T @ self.P
             H, G, g = NP @ inner.Z, inner.Z.T @ self.Q + NP @ inner.Y, inner.Z.T @ self.q0 + NP @ inner.z0
         self.free = None
-        flat = _flat_directions(H)
+        flat, share = _flat_directions(H)
         self.definite = flat is None
         if flat is not None:
             unseen = flat[:, :1] if not reduced.bounded else _unseen(flat, np.column_stack([G, g]))
@@ -59,7 +65,8 @@ class DenseMap:
                 self.free = reduced.map.Z @ (direction if inner is None else inner.Z @ direction)
             return
         right = np.column_stack([G, g])
-        K = dpotrs(dpotrf(H, lower=1)[0], right, lower=1)[0] if H.size else right
+        factor = dpotrf(H, lower=1)[0] if H.size else None
+        K = right if factor is None else dpotrs(factor, right, lower=1)[0]
         V, v = -K[:, :-1], -K[:, -1]
         if inner is not None:
             V, v = inner.Z @ V + inner.Y, inner.Z @ v + inner.z0
@@ -69,8 +76,10 @@ class DenseMap:
         if reduced.bounded:
             G, g = reduced.A[m:] @ V + reduced.E[m:], reduced.A[m:] @ v + reduced.c[m:]
             off = reduced.off_rows(flags)
+            signs = []
             for bound, sign in ((reduced.upper, 1.0), (reduced.lower, -1.0)):
                 used = bound.used if off is None else bound.used & ~off
+                signs.append((sign, used))
                 rows, constant = sign * G[used], sign * (g[used] - bound.constant[used])
                 index = bound.index[used]
                 by_data = np.flatnonzero(index >= 0)
@@ -79,17 +88,33 @@ class DenseMap:
                 constants.append(constant)
         self.T = np.ascontiguousarray(np.vstack(blocks))
         self.t = np.concatenate(constants)
+        if share < WEAK and factor is not None:
+            N = np.eye(H.shape[0]) if inner is None else inner.Z
+            lift = [outer.Z @ N]
+            if reduced.bounded:
+                held = reduced.A[m:] @ N
+                lift += [sign * held[used] for sign, used in signs]
+            self._refine = _Refinement(reduced.gradient(store, flags), V, v, N, factor, np.vstack(lift))
 
     def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """All unknowns (n,) and the violations of all bounds (<= 0 where they hold)."""
         out = self.T.dot(numbers)  # half the overhead of the operator
         out += self.t
+        if self._refine is not None:
+            out += self._refine(numbers)
         return out[: self.size], out[self.size :]
+
+    @property
+    def exact(self) -> bool:
+        """Answers are T d + t, without refinement."""
+        return self._refine is None
 
     def many(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same for many rows of numbers (count, data): (count, n) and (count, bounds)."""
         out = numbers @ self.T.T
         out += self.t
+        if self._refine is not None:
+            out += self._refine(numbers.T).T
         return out[:, : self.size], out[:, self.size :]
 
     def vectors(self, numbers: np.ndarray) -> Vectors:
@@ -97,6 +122,29 @@ class DenseMap:
         if self._vectors is None:
             self._vectors = _Vectors(self)
         return self._vectors(numbers)
+
+
+class _Refinement:
+    """What steps by the gradient of the rows add to an answer, a matrix of columns included."""
+
+    def __init__(
+        self,
+        gradient: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        V: np.ndarray,
+        v: np.ndarray,
+        N: np.ndarray,
+        factor: np.ndarray,
+        lift: np.ndarray,
+    ) -> None:
+        self._gradient, self._V, self._v, self._N, self._factor, self._lift = gradient, V, v, N, factor, lift
+
+    def __call__(self, numbers: np.ndarray) -> np.ndarray:
+        v = self._V @ numbers + (self._v if numbers.ndim == 1 else self._v[:, None])
+        total: Any = 0.0
+        for _ in range(REFINEMENTS):
+            step = -dpotrs(self._factor, self._N.T @ self._gradient(v, numbers), lower=1)[0]
+            v, total = v + self._N @ step, total + step
+        return self._lift @ total
 
 
 class _Vectors:
@@ -126,18 +174,22 @@ class _Vectors:
         return out[:first], l, u, out[second:]
 
 
-def _flat_directions(H: np.ndarray) -> np.ndarray | None:
-    """Directions (n, k) without curvature, or None where H is positive definite (scale-free test)."""
+def _flat_directions(H: np.ndarray) -> tuple[np.ndarray | None, float]:
+    """Directions (n, k) without curvature, or None where H is positive definite (scale-free test).
+
+    Also the smallest share of a diagonal entry that elimination leaves, 0 where there is none.
+    """
     if not H.size:
-        return None
+        return None, 1.0
     factor, info = dpotrf(H, lower=1)
-    if info == 0 and (np.diagonal(factor) ** 2 > INDEPENDENT * np.diagonal(H)).all():
-        return None
+    share = float((np.diagonal(factor) ** 2 / np.diagonal(H)).min()) if info == 0 else 0.0
+    if share > INDEPENDENT:
+        return None, share
     diagonal = np.diagonal(H)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     flat = values <= FREE
-    return vectors[:, flat] / scale[:, None] if flat.any() else None
+    return (vectors[:, flat] / scale[:, None] if flat.any() else None), share
 
 
 def _unseen(flat: np.ndarray, linear: np.ndarray) -> np.ndarray:
@@ -158,9 +210,10 @@ class SparseMap:
         self.reduced, self.flags = reduced, flags
         self.rows: StackedRows | None = None
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
-        solver, flat = factorized_kkt(self.P, reduced.A[: reduced.equalities])
+        solver, flat, smallest = factorized_kkt(self.P, reduced.A[: reduced.equalities])
         self.free, self.definite = None, flat is None
         self._solve: Any = solver
+        self._gradient = reduced.gradient(store, flags) if solver is not None and smallest < WEAK else None
         if flat is not None:
             linear = np.append(abs(self.Q.T @ flat), abs(self.q0 @ flat)).max()
             size = np.linalg.norm(flat) * max(spla.norm(self.Q), float(np.linalg.norm(self.q0)))
@@ -172,7 +225,13 @@ class SparseMap:
         m = reduced.equalities
         q = self.Q @ numbers + self.q0
         shift = reduced.E @ numbers + reduced.c
-        v = self._solve(np.concatenate([-q, -shift[:m]]))[: reduced.size]
+        found = self._solve(np.concatenate([-q, -shift[:m]]))
+        if self._gradient is not None:
+            E = reduced.A[:m]
+            for _ in range(REFINEMENTS):
+                v, y = found[: reduced.size], found[reduced.size :]
+                found = found - self._solve(np.concatenate([self._gradient(v, numbers) + E.T @ y, E @ v + shift[:m]]))
+        v = found[: reduced.size]
         z = reduced.map.Z @ v + reduced.map.Y @ numbers + reduced.map.z0
         l, u = reduced.bounds(numbers, self.flags)
         rows = reduced.A[m:] @ v

@@ -84,7 +84,7 @@ class QPCheck:
 
     def residuals(self) -> dict[str, float]:
         rows = self._rows
-        if self._violation is not None and isinstance(self._map, DenseMap):
+        if self._violation is not None and isinstance(self._map, DenseMap) and self._map.exact:
             return rows.certified(self._map, self._numbers, self._violation)
         primal, dual, gap = rows.residuals(
             self._values, self._numbers, self._mu, self._gradient, self._equality_multipliers

@@ -371,7 +371,7 @@ def test_kkt_systems_are_solved_or_show_what_is_free(scale: float) -> None:
     units = 10.0 ** rng.uniform(-3, 3, n)
     P = scale * (J * units).T @ (J * units)
     F = F * units
-    solve, free = factorized_kkt(sp.csr_array(P), sp.csr_array(F))
+    solve, free, _ = factorized_kkt(sp.csr_array(P), sp.csr_array(F))
     assert free is None and solve is not None
     K = np.block([[P, F.T], [F, np.zeros((m, m))]])
     right = K @ np.repeat(np.array([1.0] * n + [scale] * m)[:, None], 2, axis=1)
@@ -382,7 +382,7 @@ def test_kkt_systems_are_solved_or_show_what_is_free(scale: float) -> None:
     d = np.linalg.svd(F / np.linalg.norm(F, axis=1)[:, None])[2][-1]
     J = J * units
     J = J - np.outer(J @ d, d) / (d @ d)
-    solve, free = factorized_kkt(sp.csr_array(scale * J.T @ J), sp.csr_array(F))
+    solve, free, _ = factorized_kkt(sp.csr_array(scale * J.T @ J), sp.csr_array(F))
     assert solve is None and free is not None
     assert abs(free @ d) / (np.linalg.norm(free) * np.linalg.norm(d)) > 1 - 1e-6
 
@@ -391,7 +391,7 @@ def test_rows_that_repeat_or_are_empty_do_not_make_a_kkt_system_singular() -> No
     rng = np.random.default_rng(5)
     J, F = rng.normal(size=(8, 8)), rng.normal(size=(2, 8))
     P, more = J.T @ J, np.vstack([F, F[0], np.zeros(8)])
-    solve, free = factorized_kkt(sp.csr_array(P), sp.csr_array(more))
+    solve, free, _ = factorized_kkt(sp.csr_array(P), sp.csr_array(more))
     assert solve is not None and free is None
     right = np.zeros((12, 8))
     right[:8] = np.eye(8)
