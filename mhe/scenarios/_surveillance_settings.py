@@ -11,7 +11,15 @@ import numpy as np
 import pydantic
 
 from mhe.distributed.options import NetworkGrowthPrior
-from mhe.sporadic.options import DetectionPrior, DetectionUpdate, Disturbance, InfeasibleRows, ObserverData, RowScope
+from mhe.sporadic.options import (
+    DetectionPrior,
+    DetectionUpdate,
+    Disturbance,
+    InfeasibleRows,
+    ObserverData,
+    PieceRule,
+    RowScope,
+)
 from problems.networks import FusionRule
 
 Case = Literal[1, 2, 3, "gazebo"]
@@ -102,6 +110,11 @@ class Settings(pydantic.BaseModel, extra="forbid", frozen=True):
         "hard", description="of the methods with rows; projected concerns those with an observer, the others have hard"
     )
     row_scope: RowScope | None = pydantic.Field(None, description="detections that make rows, own or regional")
+    pieces: PieceRule = pydantic.Field(
+        "none",
+        description="of methods with rows: the road itself instead of its hull where a vehicle is detected, the road "
+        "nobody looks at where it is not (holds for detection_rate=1 only), or both",
+    )
     unmet: InfeasibleRows | None = pydantic.Field(None, description="where hard rows contradict each other")
     tolerance: float = pydantic.Field(1e-8, gt=0, description="of the solver")
 

@@ -6,7 +6,7 @@ Source: dmhe-sporadic-fov 3.1 to 3.4, 6.1 and 6.2.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from problems.networks import Network, band
 if TYPE_CHECKING:
     import shapely
 
+    from mhe.polyhedron import Polyhedron
     from mhe.sporadic.geometry import FieldOfView
 
 CORNERS = np.array([(0, 0), (-1, 1), (-1, -1), (1, -1), (1, 1)])  # leader, then the followers
@@ -41,6 +42,14 @@ class World:
     network: Network
     times: np.ndarray
     positions: np.ndarray
+
+    @cached_property
+    def unseen(self) -> list[tuple[Polyhedron, ...]]:
+        """By camera, convex pieces of the road that neither it nor a neighbour looks at."""
+        from mhe.sporadic.geometry import unseen_pieces
+
+        regions = [self.network.in_neighborhood(camera) for camera in range(self.network.count)]
+        return [unseen_pieces(self.road, [self.views[j].footprint for j in region]) for region in regions]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pydantic
 
 from mhe.scenarios._surveillance_metrics import METRICS, error_norms, errors_of, in_window, outside, over_nodes, share
 from mhe.scenarios._surveillance_settings import Settings
@@ -54,9 +55,9 @@ class Surveillance:
         "infeasible_share: of the problems of a node and a vehicle with rows, those whose rows contradict each other; "
         "outside_share: of the detections, those whose estimate is outside of the camera's part of the road"
     )
-    methods = tuple(METHODS)
-    metrics = METRICS
-    settings = Settings
+    methods: tuple[str, ...] = tuple(METHODS)
+    metrics: tuple[str, ...] = METRICS
+    settings: type[pydantic.BaseModel] = Settings
 
     def draw(self, settings: Settings, rng: np.random.Generator) -> Drawn:
         return draw(settings, rng)
@@ -94,6 +95,11 @@ class Surveillance:
         if base.rows != "none":
             # projection is about what feeds an observer
             chosen["rows"] = "hard" if settings.rows == "projected" and not observes else settings.rows
+            chosen["pieces"] = settings.pieces
+            if settings.pieces in ("detected", "both"):
+                chosen["convex_pieces"] = [view.pieces for view in world.views]
+            if settings.pieces in ("unseen", "both"):
+                chosen["unseen_pieces"] = world.unseen
         return SporadicEstimator(
             model,
             world.network,

@@ -21,7 +21,7 @@ from mhe.sporadic.parts import PartProblems
 from mhe.sporadic.ranks import WindowRank
 from mhe.sporadic.readings import Sensors
 from mhe.sporadic.rows import Projection
-from problems.errors import DataError, ShapeError
+from problems.errors import DataError, SettingError, ShapeError
 from problems.networks.weights import normalize_rows
 from problems.solvers.base import Status
 
@@ -51,11 +51,20 @@ class BatchedDetections:
     Args:
         design: of the network.
         trials: how many.
+
+    Raises:
+        DataError: no trials.
+        SettingError: sets that are not convex (``pieces``), whose search is one node's own.
     """
 
     def __init__(self, design: SporadicDesign, trials: int) -> None:
         if trials < 1:
             raise DataError(f"a batched network runs at least one trial, got {trials}")
+        if design.options.pieces != "none":
+            raise SettingError(
+                f"pieces={design.options.pieces!r} are searched node by node; run a SporadicEstimator, or set "
+                "pieces='none'"
+            )
         self.design, self.trials = design, trials
         plans = design.plans
         self._plan, self._options = plans[0], design.options
@@ -219,7 +228,7 @@ class BatchedDetections:
             active = data["row active"].any(axis=3)
         found = self._problems.solve(data)
         before = self._predicted()
-        lost = np.isnan(found.states).any(axis=(3, 4))
+        lost: Any = np.isnan(found.states).any(axis=(3, 4))
         unmet = found.unmet
         worst = np.full(active.shape[:2], Status.SOLVED, dtype=object)
         for kind in (Status.INACCURATE, *STOPPED, Status.FAILED, Status.UNBOUNDED, Status.INFEASIBLE):
