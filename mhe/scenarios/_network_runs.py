@@ -6,7 +6,7 @@ import time
 import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,6 +16,7 @@ import numpy as np
 from mhe.centralized import MovingHorizonEstimator
 from mhe.distributed import DistributedEstimator, NetworkEstimate
 from mhe.estimate import Estimate, WindowEstimate
+from mhe.polyhedron import Polyhedron
 from mhe.scenarios._network_world import METHODS, AnyEstimator, Drawn, Gains, NetworkSettings, World, make_estimator
 from problems.bench.scenario import Outcome
 from problems.errors import ModelWarning
@@ -84,21 +85,8 @@ class NetworkScenario(ABC):
             prepared = self._prepare(settings, method, solver, drawn)
         estimator = prepared.estimator
         rows = slice(None) if hasattr(estimator, "network") else self.world(settings).rows
-        record = _Record(drawn, bounded=settings.bounds != "none")
-        started = time.perf_counter()
-        estimator.reset()
-        for k, y in enumerate(drawn.measurements[:, rows]):
-            estimate = estimator.step(y)
-            if k == 0:  # nothing is solved at instant 0: fresh nodes come up and report the prior
-                record.times["setup"] += time.perf_counter() - started
-            record.add(estimate)
-        if record.infeasible:
-            warnings.warn(
-                f"{method}: {len(record.infeasible)} local problem(s) had no sequence within the bounds; first "
-                f"{record.infeasible[0]}",
-                ModelWarning,
-                stacklevel=2,
-            )
+        record = recorded(estimator, drawn.measurements[:, rows], None if settings.bounds == "none" else drawn.box)
+        warn_of_infeasible(method, record.infeasible)
         errors = np.linalg.norm(np.array(record.states) - drawn.states[:, None], axis=-1)
         return Outcome(
             metrics=self.score(errors),
@@ -132,11 +120,40 @@ class NetworkScenario(ABC):
         return plot_errors(labels, {label: outcome.trace.errors for label, outcome in outcomes.items()})
 
 
-class _Record:
+def recorded(estimator: Any, measurements: np.ndarray, box: Polyhedron | None = None) -> Record:
+    """Run an estimator from a fresh start.
+
+    Args:
+        estimator: centralized or of a network.
+        measurements: (steps, p) as its `step` takes them, instant 0 first.
+        box: bounds of the states, to note where they hold a window.
+    """
+    record = Record(box)
+    started = time.perf_counter()
+    estimator.reset()
+    for k, y in enumerate(measurements):
+        estimate = estimator.step(y)
+        if k == 0:  # nothing is solved at instant 0: fresh nodes come up and report the prior
+            record.times["setup"] += time.perf_counter() - started
+        record.add(estimate)
+    return record
+
+
+def warn_of_infeasible(method: str, infeasible: Sequence[Any]) -> None:
+    """Warn where no sequence met the bounds; called by the `run` of a scenario."""
+    if infeasible:
+        warnings.warn(
+            f"{method}: {len(infeasible)} local problem(s) had no sequence within the bounds; first {infeasible[0]}",
+            ModelWarning,
+            stacklevel=3,
+        )
+
+
+class Record:
     """What the steps of one trial leave behind; instant 0 reports the prior and counts as no step."""
 
-    def __init__(self, drawn: Drawn, bounded: bool) -> None:
-        self.box = drawn.box if bounded else None
+    def __init__(self, box: Polyhedron | None = None) -> None:
+        self.box = box
         self.states: list[np.ndarray] = []
         self.active: list[list[bool]] = []
         self.step_seconds: list[float] = []

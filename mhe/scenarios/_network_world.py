@@ -151,7 +151,7 @@ def make_estimator(
         box: bounds of the states, or None.
     """
     if method not in METHODS:
-        return _registered(world, settings, method, solver, box)
+        return registered_estimator(world, settings, method, solver, box)
     if method == "kf":
         return KalmanFilter(world.central, initial_update=False)
     observes = method.endswith("_pre")
@@ -193,7 +193,7 @@ def make_estimator(
     )
 
 
-def _registered(world: World, settings: NetworkSettings, method: str, solver: str, box: Polyhedron | None) -> Any:
+def registered_estimator(world: World, settings: Any, method: str, solver: str, box: Polyhedron | None = None) -> Any:
     """An estimator registered under the name of a method, with those of the settings it has arguments for."""
     make = registry.load("estimators", method)
     takes = inspect.signature(make).parameters

@@ -6,6 +6,7 @@ Positions, links and the active set of the published network are only in a pictu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from problems.errors import TopologyError
 from problems.models import LinearModel, Sensor
 from problems.networks import Network, within_radius
 
-FIELD = 1000.0  # m, side of the field of 100 nodes; larger networks have the same density
+DENSITY = 100.0  # nodes per square kilometre
 RADIUS = 160.0  # m, nodes closer than this hear each other
 DISTURBANCE = 0.5  # largest modulus of a component of w
 NOISE = 10.0  # m, largest modulus of a component of v
@@ -48,9 +49,20 @@ class SensorField:
     seed: int
     drawn: int
 
+    @cached_property
+    def hops(self) -> np.ndarray:
+        """(count,) hops from the nearest node with a sensor."""
+        return self.network.distances(self.active).min(axis=0)
+
 
 def sensor_field(
-    seed: int = 1, nodes: int = 100, *, share: float = 0.1, radius: float = RADIUS, largest: bool = False
+    seed: int = 1,
+    nodes: int = 100,
+    *,
+    share: float = 0.1,
+    radius: float = RADIUS,
+    density: float = DENSITY,
+    largest: bool = False,
 ) -> SensorField:
     """The reference network (seed 1, 100 nodes), or another one of the same density by the generator rule.
 
@@ -61,12 +73,13 @@ def sensor_field(
         nodes: how many are drawn.
         share: of the nodes that have a sensor, the first ones drawn.
         radius: m; strictly closer nodes are linked.
+        density: nodes per square kilometre, which makes the side of the field.
         largest: instead of another seed, take the largest component: large fields of this density are never connected.
 
     Raises:
         TopologyError: no connected graph among a thousand seeds.
     """
-    side = FIELD * float(np.sqrt(nodes / 100))
+    side = 1000.0 * float(np.sqrt(nodes / density))
     for tried in range(seed, seed + SEEDS_TRIED):
         positions = np.random.default_rng(tried).uniform(-side / 2, side / 2, (nodes, 2))
         network = within_radius(positions, radius, strict=True)
