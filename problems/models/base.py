@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any, Self
@@ -19,7 +20,7 @@ from problems.spaces import wrap
 _NOTHING = np.zeros(0)
 
 
-class Model:
+class Model(ABC):
     """Dynamics x_{k+1} = f(x_k, u_k, p) + G w_k and sensors y_k = h(x_k, u_{k-1}, p) + v_k, with Gaussian w, v, x_0.
 
     `step`, `output` and their Jacobians take CasADi columns (and return expressions, to be used in the terms of a
@@ -94,8 +95,9 @@ class Model:
             return sensor.expression(self._symbols).shape[0]
         return _checks.matrix(sensor.matrix, None, self.state_size, f"sensor {sensor.name!r}: C").shape[0]
 
+    @abstractmethod
     def _next_state(self) -> Any:
-        raise NotImplementedError
+        """f(x, u, p) as an expression in the symbols."""
 
     def with_sensors(self, sensors: Iterable[Sensor]) -> Self:
         """The same dynamics and prior observed by other sensors: a node's local or regional model."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from problems.errors import SettingError, UnobservableError
+from problems.errors import DataError, SettingError, UnobservableError
 from problems.forms.graduated import ladder
 from problems.forms.layout import Layout
 from problems.forms.least_squares import Bound, Constraints, LeastSquares
@@ -31,7 +31,7 @@ from problems.solvers.factorizations import (
     factorization,
 )
 from problems.solvers.least_squares_solution import LeastSquaresCheck
-from problems.solvers.optimality import optimality
+from problems.solvers.optimality import gauge_freedom, optimality
 from problems.solvers.qp_step import QPStep
 from problems.solvers.qp_support import checked_settings
 from problems.solvers.session import Session, Solution
@@ -91,6 +91,7 @@ class GaussNewton(Session):
         self.sparse = pattern.size > DENSE_SIZE
         self.heavy = self.sparse and pattern.work >= HEAVY_WORK
         rungs = ladder(problem) if self.settings.graduated else []
+        self._gauges: dict[bytes, str] = {}
         self._rungs = [LeastSquares(rung, Layout(rung), self.settings.whole) for rung in rungs]
         self._renew()
 
@@ -135,6 +136,19 @@ class GaussNewton(Session):
             raise UnobservableError(f"prepare: the costs leave a direction free at this point ({error})") from error
         self._prepared = (point, hessian)
 
+    def solve(self, data: Mapping[str, Any] | None = None, initial: Mapping[str, Any] | None = None) -> Solution:
+        """See `Session.solve`. After `prepare` it is one feedback step from the prepared point.
+
+        Raises:
+            DataError: `initial` together with a prepared point.
+        """
+        if initial is not None and self._prepared is not None:
+            raise DataError(
+                "the session is prepared at a point, from which the next solve is one step; give initial to prepare, "
+                "or forget the preparation by reset"
+            )
+        return super().solve(data, initial)
+
     def _solve(self) -> Solution:
         bound = self.form_.bind(self.store)
         start = self.layout.identity() if self._point is None else self._point
@@ -160,8 +174,24 @@ class GaussNewton(Session):
         if search.doubtful and status is Status.SOLVED:
             found = optimality(self.form_, self.constraints, self.pins, bound, search.point, search.multipliers)
             status, message = found.judge(status, message, self.options)
+        elif status is Status.SOLVED and not message:
+            message = self._gauge(search)
         check = LeastSquaresCheck(self.form_, self.constraints, self.pins, bound, search.point, search.multipliers)
         return Solution(self.layout, search.point, status, self.solver, check, search.iterations, message)
+
+    def _gauge(self, search: _Search) -> str:
+        """What to say of a direction that the costs do not see; looked for once per pattern of active instances."""
+        if self.constraints.size or search.hessian is None:
+            return ""
+        key = b"|".join(b"" if on is None else on.tobytes() for on in search.bound.flags.values())
+        if key not in self._gauges:
+            hessian = search.hessian
+            if not self.settings.screen:  # nothing was factorized yet
+                damped = hessian.copy()
+                damped[self.form_.pattern.diagonal] *= 1 + 1e-10
+                self._linear.factor(damped)
+            self._gauges[key] = gauge_freedom(self.form_.pattern, hessian, self._linear, self.layout)
+        return self._gauges[key]
 
 
 class _Search:
@@ -174,6 +204,7 @@ class _Search:
         self.damping = 0.0
         self.iterations = 0
         self.multipliers: np.ndarray | None = None
+        self.hessian: np.ndarray | None = None  # at the last linearization
         self.penalty = 0.0
         self.doubtful = False  # the last step was no exact one, so its decrease is no test of convergence
         self.gained: float | None = None  # decrease of the last step, where its factorization may serve again
@@ -224,6 +255,7 @@ class _Search:
         """One accepted step, or the reason to stop."""
         session = self.session
         session.pins.reduce(gradient, hessian, session.form_.pattern)
+        self.hessian = hessian
         violation = self._violation(self.point)
         kept = None if forced else self._kept_step(cost, gradient, hessian, tolerance)
         while True:

@@ -16,12 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from problems.forms.layout import Layout
 from problems.forms.least_squares import Bound, Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.forms.sparsity import HessianPattern
 from problems.solvers.base import Options, Status
-from problems.solvers.factorizations import SingularError, factorization
+from problems.solvers.factorizations import Factorization, SingularError, factorization
 
+LOOSE = 1e-13  # curvature along a direction, in the scale of the diagonal, that is none
 RIDGE = 1e-12  # of the largest diagonal entry, added so that directions the costs leave free have finite steps
 
 
@@ -34,12 +36,15 @@ class Optimality:
         decrement: see the module; NaN where it could not be computed.
         violation: largest violation of a constraint.
         free: unknowns that appear in no cost and no constraint, for people; empty where there are none.
+        gauge: what to say where the costs do not see some direction, as in graphs of relative measurements alone; such
+            a point is one of many optima. Empty where there is none; not looked for where there are constraints.
     """
 
     cost: float
     decrement: float
     violation: float
     free: str
+    gauge: str = ""
 
     def within(self, options: Options) -> bool:
         """Decrement at most 0.1 tolerance max(1, cost), violation at most 10 tolerance; NaN is not."""
@@ -57,7 +62,7 @@ class Optimality:
         if self.free:
             return Status.UNBOUNDED, _joined(f"the costs leave {self.free} free", message)
         if self.within(options):
-            return Status.SOLVED, message
+            return Status.SOLVED, _joined(self.gauge, message) if self.gauge else message
         text = f"decrement {self.decrement:.1e}, violation {self.violation:.1e}, asked for {options.tolerance:.1e}"
         if claim is Status.SOLVED:
             return Status.INACCURATE, _joined(text, message)
@@ -92,7 +97,9 @@ def optimality(
         return Optimality(float("nan"), float("nan"), float("nan"), free)
     violation = pins.violation(point, bound.numbers)
     if not constraints.size:
-        return Optimality(cost, _decrement(pattern, hessian, gradient), violation, free)
+        decrement, solver = _decrement(pattern, hessian, gradient)
+        gauge = "" if solver is None else gauge_freedom(pattern, hessian, solver, form.layout)
+        return Optimality(cost, decrement, violation, free, gauge)
     lower, upper = constraints.bounds(bound.numbers, bound.flags)
     violation = float(np.max([violation, *np.maximum(np.maximum(values - upper, lower - values), 0.0)]))
     y = np.zeros(constraints.size) if multipliers is None else multipliers.copy()
@@ -103,21 +110,45 @@ def optimality(
     dual = gradient + np.bincount(constraints.columns, entries * y[constraints.rows], pattern.size)
     dual[pins.columns] = 0.0
     if not constraints.equalities:
-        return Optimality(cost, _decrement(pattern, hessian, dual) + gap, violation, free)
+        return Optimality(cost, _decrement(pattern, hessian, dual)[0] + gap, violation, free)
     share, multipliers = _constrained(pattern, hessian, dual, constraints, entries, pins)
     gap += float(np.abs(multipliers * values[: constraints.equalities]).sum())
     return Optimality(cost, share + gap, violation, free)
 
 
-def _decrement(pattern: HessianPattern, hessian: np.ndarray, dual: np.ndarray) -> float:
+def gauge_freedom(pattern: HessianPattern, hessian: np.ndarray, solver: Factorization, layout: Layout) -> str:
+    """Says which unknowns move along a direction without curvature; empty where every direction has some.
+
+    Args:
+        solver: holds a factorization of `hessian`, also of a damped one; the direction comes by inverse iteration.
+    """
+    diagonal = hessian[pattern.diagonal]
+    direction = np.cos(np.arange(pattern.size))
+    for _ in range(3):
+        direction = solver.solve(diagonal * direction)
+        size = float(np.sqrt(np.sum(diagonal * direction**2)))
+        if not (np.isfinite(size) and size > 0):
+            return ""
+        direction /= size
+    columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+    products = hessian * direction[columns] * direction[pattern.indices]
+    if abs(float(2 * products.sum() - products[pattern.diagonal].sum())) > LOOSE:
+        return ""
+    return (
+        f"one of many optima: the costs do not see {layout.names_of(direction)} move together; hold one of them by an "
+        "equality or add a prior"
+    )
+
+
+def _decrement(pattern: HessianPattern, hessian: np.ndarray, dual: np.ndarray) -> tuple[float, Factorization | None]:
     hessian = hessian.copy()
     hessian[pattern.diagonal] += RIDGE * max(float(hessian[pattern.diagonal].max()), 1e-300)
     solver = factorization(pattern)
     try:
         solver.factor(hessian)
     except SingularError:
-        return float("nan")
-    return float(dual @ solver.solve(dual)) / 2
+        return float("nan"), None
+    return float(dual @ solver.solve(dual)) / 2, solver
 
 
 def _constrained(
