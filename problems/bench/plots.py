@@ -211,4 +211,5 @@ def _legend(figure: Figure, styles: Mapping[str, Any]) -> None:
 
     handles = [Line2D([], [], label=label, **style) for label, style in styles.items()]
     if handles:
+        figure.set_figheight(max(figure.get_figheight(), 0.215 * len(handles) + 0.3))  # or the last ones are cut off
         figure.legend(handles=handles, loc="outside right upper", frameon=False)

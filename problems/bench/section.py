@@ -249,9 +249,10 @@ class ScenarioSection:
                 for item in times
             ]
             note = (
-                f"Shifted geometric mean (shift {seconds(compare.SHIFT)}) of the solve time of a trial, over the"
-                f" same trials for all. A trial without result, or with more than {percent(compare.UNSOLVED_SHARE)} of its"
-                f" steps neither solved nor found infeasible, failed and counts as {seconds(limit)}."
+                f"Shifted geometric mean (shift {seconds(compare.SHIFT)}) of the solve time of a trial, over the same"
+                " trials for all. A trial without result, or with more than"
+                f" {percent(compare.UNSOLVED_SHARE)} of its steps neither solved nor found infeasible, failed and counts"
+                f" as {seconds(limit)}."
             )
             head = ["solver", "geometric mean", "ratio to the fastest", "failed"]
             parts.append(f"<h3>Solvers on {escape(contest.label)}</h3>")

@@ -340,6 +340,15 @@ def test_the_picture_joins_the_tolerances_of_one_method_and_solver(results: Resu
     assert len({look[0] for look in looks}) == 5
 
 
+def test_a_long_legend_fits_into_its_picture() -> None:
+    names = [f"solver-{number}" for number in range(40)]
+    figure = plots.profile({name: (np.array([1.0, 2.0]), np.array([0.5, 1.0])) for name in names}, "p")
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert legend.get_window_extent().y0 >= 0
+    assert legend.get_window_extent().y1 <= figure.bbox.height
+
+
 def test_lines_of_other_settings_are_not_joined(results: Results) -> None:
     summaries = [s for s in summarize(results.rows) if (s.scenario, s.method, s.solver) == ("toy", "mean", "swift")]
     axes: Any = plots.accuracy_against(summaries, "error", "p", plots.time_of(summaries)).figure.axes[0]
