@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,8 @@ from problems.errors import TopologyError
 from problems.networks.network import Network
 
 _ATTEMPTS = 1000
+
+Connect = Literal["component", "radius"]
 
 
 def complete(count: int) -> Network:
@@ -149,6 +152,52 @@ def random_geometric(
 
     network = draw_connected(draw)
     return network, positions
+
+
+def random_field(
+    count: int,
+    radius: float,
+    rng: np.random.Generator,
+    *,
+    density: float,
+    connect: Connect = "component",
+    reference: int = 100,
+    strict: bool = False,
+) -> tuple[Network, np.ndarray, np.ndarray]:
+    """Uniform random positions in a square of constant density, linked within a radius, for any number of nodes.
+
+    At constant density and radius large graphs are practically never connected: either the largest component is kept,
+    or the radius grows with ``sqrt(ln count)``, which keeps the chance of a connected graph, and then is redrawn until
+    it is.
+
+    Args:
+        count: nodes drawn.
+        radius: metres; with ``connect="radius"`` that of a network of `reference` nodes.
+        rng: source of the positions.
+        density: nodes per square metre.
+        connect: ``component`` or ``radius``.
+        reference: see `radius`.
+        strict: as in `within_radius`.
+
+    Returns:
+        The network, the positions (nodes, 2) around the origin, and which of the drawn nodes (nodes,) are in it.
+
+    Raises:
+        TopologyError: no nodes, a density that is not positive, no such rule, no connected graph in a thousand draws.
+    """
+    if count < 1 or not density > 0 or connect not in get_args(Connect):
+        raise TopologyError(
+            f"a field needs nodes, a positive density and connect='component' or 'radius', got {count} node(s), "
+            f"density {density:g}, connect={connect!r}"
+        )
+    half = np.sqrt(count / density) / 2
+    if connect == "radius":
+        grown = radius * float(np.sqrt(np.log(max(count, 2)) / np.log(max(reference, 2))))
+        network, positions = random_geometric(count, grown, rng, low=-half, high=half, strict=strict)
+        return network, positions, np.arange(count)
+    positions = rng.uniform(-half, half, (count, 2))
+    kept = max(within_radius(positions, radius, strict=strict).components(), key=len)
+    return within_radius(positions[kept], radius, strict=strict), positions[kept], kept
 
 
 def erdos_renyi(count: int, probability: float, rng: np.random.Generator) -> Network:
