@@ -350,10 +350,10 @@ class Activity:
             for term, _, _ in self._terms
         ]
 
-    def key(self, numbers: np.ndarray) -> bytes:
-        """Identifies the pattern; equal keys give equal `flags`."""
-        missing = np.isnan(numbers)
-        head = missing.tobytes() if missing.any() else b""
+    def key(self, numbers: np.ndarray, finite: bool = False) -> bytes:
+        """Identifies the pattern; equal keys give equal `flags`. `finite` numbers are not searched for NaN."""
+        missing = None if finite else np.isnan(numbers)
+        head = missing.tobytes() if missing is not None and missing.any() else b""
         return head + b"|" + numbers[self.switches].tobytes() if self.switches.size else head
 
     def flags(self, numbers: np.ndarray) -> list[np.ndarray | None]:

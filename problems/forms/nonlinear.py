@@ -16,9 +16,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from problems.forms.cost_groups import Flags, whitening_numbers
 from problems.forms.kernels import cost_kernel, gate
 from problems.forms.layout import Activity, DataStore, Layout, TermLayout, constant_rows
-from problems.forms.least_squares import Constraints, Flags, whitening_numbers
+from problems.forms.least_squares import Constraints
 from problems.forms.sparsity import HessianPattern
 from problems.forms.template import Template, template_of
 from problems.noise import Loss

@@ -12,8 +12,10 @@ import scipy.sparse as sp
 
 from problems import SE2, SO2, Cauchy, Gaussian, GemanMcClure, Huber, Problem, Tukey, Vector, wrap
 from problems.errors import DataError, UnobservableError
+from problems.forms import least_squares
+from problems.forms.cost_groups import ArrayCosts, MappedCosts, WholeCosts
 from problems.forms.layout import DataStore, Layout
-from problems.forms.least_squares import WHOLE_LIMIT, Constraints, LeastSquares
+from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.solvers.factorizations import CLASSES, SingularError
 from problems.solvers.linear import covariance_blocks, factorized_kkt
@@ -154,6 +156,19 @@ class World:
         return value, gradient, sum(w * J.T @ J for (_, w, _), J in zip(here, slopes, strict=True))
 
 
+WAYS = ("whole", "loop", "arrays", "mixed")
+
+
+def evaluator(p: Problem, layout: Layout, way: str) -> LeastSquares:
+    """Costs evaluated one way; mixed: terms of up to 5 instances by CasADi's loop, the others by array code."""
+    if way in ("whole", "arrays"):
+        return LeastSquares(p, layout, way == "whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(least_squares, "WHOLE_WORK", 0)
+        patch.setattr(least_squares, "LOOP_COUNT", 5 if way == "mixed" else 1000)
+        return LeastSquares(p, layout)
+
+
 def full(form: LeastSquares, entries: np.ndarray) -> np.ndarray:
     n = form.pattern.size
     H = np.zeros((n, n))
@@ -165,8 +180,8 @@ def full(form: LeastSquares, entries: np.ndarray) -> np.ndarray:
 def test_both_evaluators_equal_the_reference(seed: int) -> None:
     world = World(seed)
     value, gradient, H = world.reference()
-    for whole in (True, False):
-        form = LeastSquares(world.p, world.layout, whole)
+    for way in WAYS:
+        form = evaluator(world.p, world.layout, way)
         bound = form.bind(world.store)
         cost, g, entries = bound.linearize(world.at)
         assert cost == pytest.approx(value, rel=1e-12)
@@ -178,22 +193,39 @@ def test_both_evaluators_equal_the_reference(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(6, 10))
 def test_the_evaluators_agree_to_rounding(seed: int) -> None:
     world = World(seed)
-    one, two = (LeastSquares(world.p, world.layout, whole).bind(world.store) for whole in (True, False))
-    for a, b in zip(one.linearize(world.at), two.linearize(world.at), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
+    one, *others = (evaluator(world.p, world.layout, way).bind(world.store) for way in WAYS)
+    for other in others:
+        for a, b in zip(one.linearize(world.at), other.linearize(world.at), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
 
 
-def test_the_evaluator_is_chosen_by_size() -> None:
-    for count, whole in ((WHOLE_LIMIT, True), (WHOLE_LIMIT + 1, False)):
-        p = Problem()
-        p.cost("c", lambda x: x, on=p.variables("x", Vector(1), count))
-        assert LeastSquares(p, Layout(p)).whole is whole
+def turned(x: Any) -> Any:
+    for _ in range(40):
+        x = ca.sin(x) + 1
+    return x
+
+
+@pytest.mark.parametrize(
+    ("counts", "kinds"),
+    [
+        ((20,), [WholeCosts]),
+        ((150,), [MappedCosts]),  # too many instructions in all
+        ((150, 150), [MappedCosts]),
+        ((150, 301), [MappedCosts, ArrayCosts]),
+        ((301,), [ArrayCosts]),
+    ],
+)
+def test_evaluators_are_chosen_by_instructions_and_instances(counts: tuple[int, ...], kinds: list[type]) -> None:
+    p = Problem()
+    for k, count in enumerate(counts):
+        p.cost(f"c{k}", turned, on=p.variables(f"x{k}", Vector(1), count))
+    assert [type(group) for group in LeastSquares(p, Layout(p)).groups] == kinds
 
 
 def test_what_was_bound_does_not_follow_later_data() -> None:
-    for whole in (True, False):
+    for way in WAYS:
         world = World(1)
-        form = LeastSquares(world.p, world.layout, whole)
+        form = evaluator(world.p, world.layout, way)
         bound = form.bind(world.store)
         before = [np.array(part) for part in bound.linearize(world.at)]
         world.store.set("z", np.zeros((9, 2)))
@@ -205,9 +237,9 @@ def test_what_was_bound_does_not_follow_later_data() -> None:
 
 
 def test_results_are_new_arrays() -> None:
-    for whole in (True, False):
+    for way in WAYS:
         world = World(2)
-        bound = LeastSquares(world.p, world.layout, whole).bind(world.store)
+        bound = evaluator(world.p, world.layout, way).bind(world.store)
         _, g, h = bound.linearize(world.at)
         kept = g.copy(), h.copy()
         bound.linearize(world.at + 0.1)
@@ -216,11 +248,11 @@ def test_results_are_new_arrays() -> None:
 
 
 def test_instances_that_are_off_count_nothing_even_where_they_are_not_finite() -> None:
-    for whole in (True, False):
+    for way in WAYS:
         p = Problem()
         x, z, on = p.variables("x", Vector(1), 3), p.data("z", (), 3), p.data("on", (), 3)
         p.cost("c", lambda x, z: ca.log(x) - ca.sqrt(z), on=x, data=z, active=on)
-        form = LeastSquares(p, Layout(p), whole)
+        form = evaluator(p, Layout(p), way)
         store = DataStore(form.layout)
         store.set("z", [4.0, np.nan, -1.0])
         store.set("on", [1, 1, 0])
