@@ -87,7 +87,8 @@ def accuracy_against(summaries: Sequence[Summary], metric: str, prefix: str, cos
     """
     figure, axes = _figure()
     shown = [each for each in summaries if cost.of(each) and each.metrics.get(metric) is not None]
-    styles = _styles(list(dict.fromkeys(summary.label for summary in shown)))
+    looks = _styles(list(dict.fromkeys(summary.label for summary in summaries)))  # the same in all pictures
+    styles = {label: looks[label] for label in dict.fromkeys(summary.label for summary in shown)}
     groups = []
     for number, (label, style) in enumerate(styles.items()):
         own = [summary for summary in shown if summary.label == label]

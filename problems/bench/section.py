@@ -251,8 +251,8 @@ class ScenarioSection:
             note = (
                 f"Shifted geometric mean (shift {seconds(compare.SHIFT)}) of the solve time of a trial, over the same"
                 " trials for all. A trial without result, or with more than"
-                f" {percent(compare.UNSOLVED_SHARE)} of its steps neither solved nor found infeasible, failed and counts"
-                f" as {seconds(limit)}."
+                f" {percent(compare.UNSOLVED_SHARE)} of its steps neither solved nor found infeasible, failed and"
+                f" counts as {seconds(limit)}."
             )
             head = ["solver", "geometric mean", "ratio to the fastest", "failed"]
             parts.append(f"<h3>Solvers on {escape(contest.label)}</h3>")
@@ -304,7 +304,8 @@ class ScenarioSection:
         for effect in _sample(effects, COMPARISONS_SHOWN):
             cells = [text_cell(f"{effect.setting} = {as_text(effect.value)}"), text_cell(as_text(effect.baseline))]
             cells += [text_cell(effect.method), text_cell(effect.solver)]
-            cells += [_setting(effect.settings.get(key)) for key in self.settings]
+            own = {effect.setting: "–"}
+            cells += [_setting((effect.settings | own).get(key)) for key in self.settings]
             cells += [
                 _difference(effect.metric, number),
                 _difference(effect.time, seconds),
