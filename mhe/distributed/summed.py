@@ -169,7 +169,7 @@ class Region:
         C = csr_array((outputs.C[rows].ravel(), at), shape=(count * n, p))
         self._L = None if gains is None else csr_array((gains.ravel(), at), shape=(count * n, p))
         # one product for both sums
-        self._both = C if self._L is None else csr_array(block_diag([C, self._L], format="csr"))
+        self._both: Any = C if self._L is None else csr_array(block_diag([C, self._L], format="csr"))
         self._squares = (outputs.C[:, :, None] * outputs.weighted[:, None]).reshape(p, n * n)
 
     def sums(self, summands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
