@@ -210,12 +210,7 @@ class Window:
 
     def quadratic(self, solver: str) -> bool:
         """Whether a solver is given a quadratic program."""
-        if not is_affine(self.problem):
-            return False
-        if solver == "auto":
-            return True
-        entry = registry.load("solvers", ALIASES.get(solver, solver).partition(":")[0])
-        return getattr(entry, "forms", ("quadratic",))[0] == "quadratic"
+        return is_affine(self.problem) and prefers_quadratic(solver)
 
     def _reason(self, solver: str) -> str:
         return f"solver {solver} takes another form" if is_affine(self.problem) else "this window is nonlinear"
@@ -418,6 +413,14 @@ class Window:
             {"x": self.x[:-1], "ahead": self.x[1:]},
             {"u": self._u[1:]} if self._u is not None else {},
         )
+
+
+def prefers_quadratic(solver: str) -> bool:
+    """Whether a registered solver is given a quadratic program where the problem is one."""
+    if solver == "auto":
+        return True
+    entry = registry.load("solvers", ALIASES.get(solver, solver).partition(":")[0])
+    return getattr(entry, "forms", ("quadratic",))[0] == "quadratic"
 
 
 def _rows_of(polyhedron: Polyhedron, point: Any) -> Any:

@@ -76,12 +76,14 @@ def draw_network(axes: Axes, field: SensorField, states: np.ndarray | None = Non
     size = float(np.clip(3500 / count, 2, 36))
     links = field.network.edges
     links = links[links[:, 0] < links[:, 1]]
-    axes.add_collection(LineCollection(list(field.positions[links]), colors=LINK, linewidths=size / 60, zorder=0))
-    hops = field.hops
+    axes.add_collection(
+        LineCollection(list(field.positions[links]), colors=LINK, linewidths=np.clip(size / 60, 0.2, 0.6), zorder=0)
+    )
+    last = len(HOPS) - 1
+    hops = np.minimum(field.hops, last)
     for distance in range(int(hops.max()) + 1):
-        at = field.positions[hops == distance]
-        colour = HOPS[min(distance, len(HOPS) - 1)]
-        what = "sensor" if not distance else f"{distance} hop{'s' * (distance > 1)}"
+        at, colour = field.positions[hops == distance], HOPS[distance]
+        what = "sensor" if not distance else f"{distance}{'+' * (distance == last)} hop{'s' * (distance > 1)}"
         marker = {"marker": "^", "s": 2.2 * size, "edgecolors": "black"} if not distance else {"s": size}
         axes.scatter(
             *at.T, color=colour, linewidths=0.6, label=f"{what}: {len(at)}", zorder=2 + (not distance), **marker

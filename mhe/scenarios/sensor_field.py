@@ -24,6 +24,7 @@ from mhe.scenarios._network_runs import recorded, warn_of_infeasible
 from mhe.scenarios._network_world import World, registered_estimator
 from mhe.scenarios._sensor_field_settings import Settings
 from mhe.scenarios.sensor_field_world import FieldTrial, SensorField, draw_trial, sensor_field
+from mhe.window import prefers_quadratic
 from problems.bench.scenario import Curve, Outcome
 from problems.solvers.base import Status
 
@@ -31,8 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CENTRALIZED = ("kf", "mhe")
-# arrival costs far from sensors weigh next to nothing (errata 7 and 10); in this form they keep their digits
-FORMS = {"dmhe_f": "F3", "dmhe_b": "F3"}
+ESTIMATES_DISTURBANCES = ("dmhe_f", "dmhe_b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,8 +205,10 @@ class SensorFieldScenario:
             "weights": settings.weights,
             "solver": solver,
             "tolerance": settings.tolerance,
-            "form": FORMS.get(method),
         }
+        if method in ESTIMATES_DISTURBANCES and prefers_quadratic(solver):
+            # arrival costs far from sensors weigh next to nothing (errata 7, 10) and keep their digits only here
+            common["form"] = "F3"
         if method not in RELAY_METHODS:
             return common
         names = ("latency", "startup", "omega", "alpha", "arrival_divisor", "S", "gains")

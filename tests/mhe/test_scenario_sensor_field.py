@@ -111,12 +111,15 @@ def test_a_campaign_is_its_trials() -> None:
             assert np.allclose(trace.errors, scenario.run(settings, method, "auto", trial).trace.errors, atol=1e-9)
 
 
-def test_a_named_solver_is_called() -> None:
+@pytest.mark.filterwarnings("ignore::problems.errors.ModelWarning")
+@pytest.mark.parametrize("solver", ["daqp", "gauss-newton"])
+@pytest.mark.parametrize("method", ["dmhe_f", "dmhe_1_pre"])
+def test_a_named_solver_is_called(method: str, solver: str) -> None:
     settings = Settings(**SMALL)
     trial = drawn(settings)
-    free, called = (scenario.run(settings, "dmhe_1_pre", solver, trial) for solver in ("auto", "daqp"))
+    free, called = (scenario.run(settings, method, name, trial) for name in ("auto", solver))
     assert np.allclose(free.trace.errors, called.trace.errors, atol=1e-6)
-    assert called.options["solver"] == "daqp"
+    assert called.options["solver"] == solver
 
 
 def test_the_largest_component_of_a_large_field() -> None:
