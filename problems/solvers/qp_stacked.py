@@ -18,7 +18,7 @@ from problems.forms.quadratic import QuadraticProgram, clean
 from problems.noise import information_matrix
 from problems.problem import DataSlot
 from problems.solvers.linear import FREE
-from problems.solvers.qp_maps import INDEPENDENT
+from problems.solvers.qp_maps import INDEPENDENT, REFINEMENTS, WEAK
 
 CHUNK_NUMBERS = 4_000_000  # of temporary arrays, roughly
 
@@ -125,6 +125,23 @@ def _bound(bound: Bounds, numbers: np.ndarray) -> np.ndarray:
 
 
 @dataclass(eq=False)
+class _Costs:
+    """Rows of the costs of some sets: (R' W, R, E) of every term, and what linear costs add to the gradient."""
+
+    rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    linear: np.ndarray
+
+    def refine(self, V: np.ndarray, P: np.ndarray, sets: np.ndarray) -> None:
+        """Improve the answers V (sets, k, vector data and constant) of some sets by the gradient of the rows."""
+        for _ in range(REFINEMENTS):
+            gradient = self.linear[sets]
+            for term in self.rows:
+                WR, R, E = (part if len(part) == 1 else part[sets] for part in term)
+                gradient = gradient + WR @ (R @ V[sets] + E)
+            V[sets] -= np.linalg.solve(P[sets], gradient)
+
+
+@dataclass(eq=False)
 class StackedMaps:
     """Answers ``z = T d + t`` of many sets while no inequality is active.
 
@@ -205,10 +222,12 @@ class StackedProgram:
             given = numbers[part]
             flags = self._flags(given)
             cleaned = clean(given)
-            P, Q, Z, Y = self._condensed(cleaned, flags)
-            P, L, definite[part] = _factors(P)
+            P, Q, Z, Y, costs = self._condensed(cleaned, flags)
+            P, L, definite[part], weak = _factors(P)
             self.factorizations += len(given)
             V = -np.linalg.solve(P, Q)
+            if weak.size:
+                costs.refine(V, P, weak)
             answer = V if Z is None else Z @ V + Y
             T[part], t[part] = answer[..., :-1], answer[..., -1]
             definite[part] &= np.isfinite(answer).all(axis=(1, 2))
@@ -268,10 +287,11 @@ class StackedProgram:
         return Z, Y
 
     def _condensed(self, numbers: np.ndarray, flags: dict[int, Any]) -> tuple[Any, ...]:
-        """P (sets, k, k), Q (sets, k, vector data and constant) of the kept unknowns, and the map to all of them."""
+        """P (sets, k, k), Q (sets, k, vector data and constant) of the kept unknowns, the map to all, and the rows."""
         Z, Y = self._eliminate(numbers) if self._equalities else (None, None)
         k, d = self._kept.size, self.columns.size + 1
         P, Q = np.zeros((len(numbers), k, k)), np.zeros((len(numbers), k, d))
+        costs = _Costs([], np.zeros_like(Q))
         for part in self._costs:
             entry, on = part[0], flags[id(part[0])]
             term = self._term(part, numbers)
@@ -290,8 +310,9 @@ class StackedProgram:
             WR = np.swapaxes(_flat(W @ R), -1, -2)
             P += WR @ _flat(R)
             Q += WR @ _flat(E)
-            self._add_linear(entry, R, on, Q)
-        return P, Q, Z, Y
+            self._add_linear(entry, R, on, costs.linear)
+            costs.rows.append((WR, _flat(R), _flat(E)))
+        return P, Q + costs.linear, Z, Y, costs
 
     def _information(self, entry: TermLayout, dim: int, numbers: np.ndarray) -> np.ndarray:
         """(sets or 1, count or 1, dim, dim)."""
@@ -330,21 +351,22 @@ def _flat(rows: np.ndarray) -> np.ndarray:
     return rows.reshape(len(rows), -1, rows.shape[-1])
 
 
-def _factors(P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """P with what is not definite replaced by the identity, Cholesky factors, and which sets are definite."""
+def _factors(P: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """P with what is not definite replaced by the identity, Cholesky factors, which sets are definite, weak sets."""
     definite = np.full(len(P), True)
     diagonal = np.einsum("sii->si", P)
     try:
         L = np.linalg.cholesky(P)
-        doubtful = np.flatnonzero((np.einsum("sii->si", L) ** 2 <= INDEPENDENT * diagonal).any(axis=1))
+        share = (np.einsum("sii->si", L) ** 2 / diagonal).min(axis=1, initial=1.0)
     except np.linalg.LinAlgError:
-        L, doubtful = None, np.arange(len(P))
+        L, share = None, np.zeros(len(P))
+    doubtful = np.flatnonzero(share <= INDEPENDENT)
     if doubtful.size:  # the scale-free test of `DenseMap`
         scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))[doubtful]
         smallest = np.linalg.eigvalsh(P[doubtful] * scale[:, :, None] * scale[:, None])[:, 0]
-        definite[doubtful] = smallest > FREE
+        definite[doubtful], share[doubtful] = smallest > FREE, smallest
         if L is None or not definite.all():
             P = np.where(definite[:, None, None], P, np.eye(P.shape[-1]))
             L = np.linalg.cholesky(P)
     assert L is not None
-    return P, L, definite
+    return P, L, definite, np.flatnonzero(definite & (share < WEAK))

@@ -142,6 +142,36 @@ def test_entries_without_a_minimum_are_reported_and_the_others_answered() -> Non
     assert found.status[7] == "unbounded" and (np.delete(found.status, 7) == "solved").all()
 
 
+@pytest.mark.parametrize("sigma", [1e-4, 1e-6])
+def test_small_weights_keep_their_digits(sigma: float) -> None:
+    """A chain of precise differences with one coarse fix for each of 20 places."""
+    rng, count, entries = np.random.default_rng(8), 20, 30
+    problem = Problem("chain")
+    x = problem.variables("x", Vector(1), count)
+    fix, step = problem.data("fix", 1, count), problem.data("step", 1, count - 1)
+    weight = problem.data("weight", (1, 1))
+    problem.cost("fix", lambda x, z: x - z, x, fix, Gaussian(information=weight))
+    problem.cost("step", lambda a, b, z: b - a - z, (x[:-1], x[1:]), step, Gaussian(sigma))
+    place = rng.uniform(0, 100, (entries, count, 1))
+    data = {
+        "fix": place + rng.normal(size=place.shape),
+        "step": np.diff(place, axis=1) + sigma * rng.normal(size=(entries, count - 1, 1)),
+        "weight": rng.uniform(0.5, 2.0, (entries, 1, 1)),
+    }
+    batch = problem.compile("auto").batch(entries)
+    assert batch._program is not None  # type: ignore[attr-defined]
+    found = batch.solve(data)
+    assert (found.method == "linear").all()
+    for k in range(entries):
+        root = np.sqrt(data["weight"][k, 0, 0])
+        A = np.vstack([root * np.eye(count), np.diff(np.eye(count), axis=0) / sigma])
+        b = np.concatenate([root * data["fix"][k, :, 0], data["step"][k, :, 0] / sigma]).astype(np.longdouble)
+        exact = np.zeros(count, np.longdouble)
+        for _ in range(6):
+            exact = exact + np.linalg.lstsq(A, (b - A.astype(np.longdouble) @ exact).astype(float), rcond=None)[0]
+        np.testing.assert_allclose(found["x"][k, :, 0], exact.astype(float), rtol=0, atol=1e-8)
+
+
 def test_a_weight_that_is_none_is_named() -> None:
     data = drawn(4, False, np.random.default_rng(5))
     data["information"][2] = -np.eye(STATES)
