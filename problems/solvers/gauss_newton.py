@@ -91,7 +91,7 @@ class GaussNewton(Session):
         self.sparse = pattern.size > DENSE_SIZE
         self.heavy = self.sparse and pattern.work >= HEAVY_WORK
         rungs = ladder(problem) if self.settings.graduated else []
-        self._gauges: dict[bytes, str] = {}
+        self._known_gauge: tuple[bytes, str] | None = None
         self._rungs = [LeastSquares(rung, Layout(rung), self.settings.whole) for rung in rungs]
         self._renew()
 
@@ -180,18 +180,18 @@ class GaussNewton(Session):
         return Solution(self.layout, search.point, status, self.solver, check, search.iterations, message)
 
     def _gauge(self, search: _Search) -> str:
-        """What to say of a direction that the costs do not see; looked for once per pattern of active instances."""
+        """What to say of a direction that the costs do not see; looked for when the active instances change."""
         if self.constraints.size or search.hessian is None:
             return ""
         key = b"|".join(b"" if on is None else on.tobytes() for on in search.bound.flags.values())
-        if key not in self._gauges:
+        if self._known_gauge is None or self._known_gauge[0] != key:
             hessian = search.hessian
             if not self.settings.screen:  # nothing was factorized yet
                 damped = hessian.copy()
                 damped[self.form_.pattern.diagonal] *= 1 + 1e-10
                 self._linear.factor(damped)
-            self._gauges[key] = gauge_freedom(self.form_.pattern, hessian, self._linear, self.layout)
-        return self._gauges[key]
+            self._known_gauge = key, gauge_freedom(self.form_.pattern, hessian, self._linear, self.layout)
+        return self._known_gauge[1]
 
 
 class _Search:
