@@ -6,7 +6,7 @@ a check costs a few matrix-vector products.
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,9 @@ from problems.problem import DataSlot
 from problems.solvers.active import active_rows
 from problems.solvers.linear import covariance_blocks
 from problems.solvers.qp_maps import DenseMap
+
+_ONE, _NONE = np.ones(1), np.zeros(0)
+_MISSED = 1.0  # distance to a bound that is not there: a multiplier on it is no certificate, and the gap shows it
 
 
 class StackedRows:
@@ -49,72 +52,73 @@ class StackedRows:
         slope_d, slope = self._weighted[1] + self._linear[0], self._weighted[2] + self._linear[1]
         R = self._costs[0].T
         self._hessian = R @ self._weighted[0]
-        others = _stacked([*equal, *bounded], size, data, self._dense)
-        join: Any = np.vstack if self._dense else partial(sp.vstack, format="csr")
-        self._M = join([self._hessian, others[0]])
-        self._D = join([R @ slope_d, others[1]])
-        self._m = np.concatenate([R @ slope, others[2]])
         self.equalities, self.inequalities = _named(equal), _named(bounded)
-        middle = size + (self.equalities[-1][1].stop if equal else 0)
-        self._gradient, self._equal, self._bounded = slice(0, size), slice(size, middle), slice(middle, None)
-        self._equal_rows, self._bounded_rows = self._M[self._equal], self._M[self._bounded]
-        self._off = np.concatenate([np.zeros(0, bool), *(_off(r, flags.get(r.layout.term.name)) for r in bounded)])
-        self._limits = (Bounds.of(program.layout, bounded, "lower"), Bounds.of(program.layout, bounded, "upper"))
-        self._fixed = None if any((b.index >= 0).any() for b in self._limits) else self._bounds(store.numbers)
+        (E, F, e), (G, H, g) = (_stacked(part, size, data, self._dense) for part in (equal, bounded))
+        self._equal, self._bounded = E, (G, H, g)
+        off = np.concatenate([np.zeros(0, bool), *(_off(r, flags.get(r.layout.term.name)) for r in bounded)])
+        self._limits = [
+            _limit(Bounds.of(program.layout, bounded, side), none, off, data)
+            for side, none in (("lower", -np.inf), ("upper", np.inf))
+        ]
+        self._from_data = any(taken.nnz for taken, _ in self._limits)
+        self._rows = _joined(
+            [
+                [self._hessian, G.T, R @ slope_d, (R @ slope)[:, None]],
+                [E, None, F, e[:, None]],
+                _excess(1.0, self._bounded, self._limits[1]),
+                _excess(-1.0, self._bounded, self._limits[0]),
+            ],
+            [size, E.shape[0], g.size, g.size],
+            [size, g.size, data, 1],
+            self._dense,
+        )
+        first, second = size + e.size, size + e.size + g.size
+        self._gradient, self._missed = slice(0, size), slice(size, first)
+        self._excess, self._above, self._below = slice(first, None), slice(first, second), slice(second, None)
+        self._free = np.zeros(g.size)
         self._certificate: tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]] | None = None
         self._covariances: dict[bytes, np.ndarray] = {}
 
-    def values(self, z: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """All rows at the point z (n,) for the data d."""
-        out = self._M.dot(z)
-        out += self._D.dot(d)
-        out += self._m
-        return out
+    def values(self, z: np.ndarray, mu: np.ndarray | None, d: np.ndarray) -> np.ndarray:
+        """All rows at the point z (n,) with multipliers `mu` (None: none is active) for the data d, by one product.
+
+        They are the gradient of costs and inequalities, the equalities, and all excesses over bounds: over upper ones
+        and then below lower ones.
+        """
+        return self._rows.dot(np.concatenate((z, self._free if mu is None else mu, d, _ONE)))
 
     def objective(self, z: np.ndarray, d: np.ndarray) -> float:
         r, s = (R @ z + E @ d + c for R, E, c in (self._costs, self._weighted))
         return float(r @ (0.5 * s + (self._linear[0] @ d + self._linear[1])))
 
-    def gradient(self, values: np.ndarray, mu: np.ndarray | None) -> np.ndarray:
-        """Of costs and inequalities with multipliers `mu` (None: none is active)."""
-        g = values[self._gradient]
-        return g if mu is None else g + self._bounded_rows.T.dot(mu)
-
     @cached_property
     def _inverse(self) -> np.ndarray:
-        return np.linalg.pinv(self._equal_rows.T, rcond=1e-12)
+        return np.linalg.pinv(self._equal.T, rcond=1e-12)
 
     @cached_property
     def _solve_normal(self) -> Any:
-        return spla.factorized(sp.csc_matrix(self._equal_rows @ self._equal_rows.T))
+        return spla.factorized(sp.csc_matrix(self._equal @ self._equal.T))
 
-    def equality_multipliers(self, gradient: np.ndarray) -> np.ndarray:
+    def equality_multipliers(self, values: np.ndarray) -> np.ndarray:
         """Least-squares multipliers: what remains of the stationarity condition is its residual."""
         if not self.equalities:
-            return np.zeros(0)
-        if self._dense:
-            return -(self._inverse @ gradient)
-        return self._solve_normal(-(self._equal_rows @ gradient))
+            return _NONE
+        gradient = values[self._gradient]
+        return -(self._inverse @ gradient) if self._dense else self._solve_normal(-(self._equal @ gradient))
 
-    def residuals(
-        self, values: np.ndarray, d: np.ndarray, mu: np.ndarray | None, gradient: np.ndarray, lam: np.ndarray
-    ) -> tuple[float, float, float]:
+    def residuals(self, values: np.ndarray, mu: np.ndarray | None, lam: np.ndarray) -> tuple[float, float, float]:
         """``primal``, ``dual`` and the absolute gap."""
-        primal, gap, dual = 0.0, 0.0, gradient
+        primal, gap, dual = 0.0, 0.0, values[self._gradient]
         if self.equalities:
-            dual = gradient + self._equal_rows.T @ lam
-            primal = float(np.abs(values[self._equal]).max())
+            dual = dual + self._equal.T.dot(lam)
+            primal = float(np.abs(values[self._missed]).max())
         if self.inequalities:
-            r = values[self._bounded]
-            lower, upper = self.bounds(d)
-            primal = max(primal, float(np.maximum.reduce(np.maximum(r - upper, lower - r))))
+            primal = max(primal, float(np.maximum.reduce(values[self._excess])))
             if mu is not None:
-                held = mu.nonzero()[0]
-                force = mu[held]
-                missed = np.where(force > 0, upper[held], lower[held]) - r[held]
-                # a multiplier on a side without a bound is no certificate: let the gap show it
-                missed[np.isinf(missed)] = 1.0
-                gap = float(np.abs(force).dot(np.abs(missed)))
+                missed = np.abs(np.where(mu > 0, values[self._above], values[self._below]))
+                if self._from_data:
+                    missed[missed >= 0.5 * INFINITE] = _MISSED
+                gap = float(np.abs(mu).dot(missed))
         return primal, float(np.maximum.reduce(np.abs(dual))), gap
 
     def certified(self, map_: DenseMap, d: np.ndarray, violation: float) -> dict[str, float]:
@@ -133,38 +137,66 @@ class StackedRows:
     def _certify(self, map_: DenseMap) -> tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]:
         n = map_.size
         V = np.column_stack([map_.T[:n], map_.t[:n]])
-        given = np.column_stack([self._D, self._m])
-        values, sizes = self._M @ V + given, np.abs(self._M) @ np.abs(V) + np.abs(given)
+        rows = self._rows[: self._missed.stop]
+        M, given = rows[:, :n], rows[:, n + self._free.size :]
+        values, sizes = M @ V + given, np.abs(M) @ np.abs(V) + np.abs(given)
         dual = values[self._gradient]
         if self.equalities:
-            dual = dual - self._equal_rows.T @ (self._inverse @ dual)
+            dual = dual - self._equal.T @ (self._inverse @ dual)
         rounding = 2 * V.shape[1] * np.finfo(float).eps
-        parts = ((dual, sizes[self._gradient]), (values[self._equal], sizes[self._equal]))
+        parts = ((dual, sizes[self._gradient]), (values[self._missed], sizes[self._missed]))
         largest = [(np.abs(exact) + rounding * size).max(axis=0, initial=0.0) for exact, size in parts]
         first, second = ((np.ascontiguousarray(part[:-1]), float(part[-1])) for part in largest)
         return first, second
 
-    def bounds(self, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of all inequality rows, infinite where an instance is off."""
-        return self._bounds(d) if self._fixed is None else self._fixed
-
-    def _bounds(self, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        lower, upper = (bound(d) for bound in self._limits)
-        lower = np.where(self._off | (lower <= -INFINITE), -np.inf, lower)
-        return lower, np.where(self._off | (upper >= INFINITE), np.inf, upper)
-
-    def active(self, values: np.ndarray, d: np.ndarray, mu: np.ndarray | None) -> np.ndarray:
+    def active(self, z: np.ndarray, d: np.ndarray, mu: np.ndarray | None) -> np.ndarray:
         """1 at the upper bound, -1 at the lower, 0 between."""
-        return active_rows(values[self._bounded], *self.bounds(d), mu)
+        G, H, g = self._bounded
+        lower, upper = (taken @ d + constant for taken, constant in self._limits)
+        return active_rows(G @ z + H @ d + g, lower, upper, mu)
 
     def covariance(self, columns: np.ndarray) -> np.ndarray:
         """Rows and columns `columns` of the covariance; it depends on no vector data, so it is kept."""
         key = columns.tobytes()
         found = self._covariances.get(key)
         if found is None:
-            hessian, equal = sp.csr_array(self._hessian), sp.csr_array(self._equal_rows)
+            hessian, equal = sp.csr_array(self._hessian), sp.csr_array(self._equal)
             found = self._covariances[key] = covariance_blocks(self._layout, hessian, equal, columns)
         return found.copy()
+
+
+def _limit(bounds: Bounds, none: float, off: np.ndarray, data: int) -> tuple[Any, np.ndarray]:
+    """One side's bounds of all inequality rows as an affine function of the data, none where an instance is off."""
+    rows = np.flatnonzero((bounds.index >= 0) & ~off)
+    taken = sp.csr_array((np.ones(rows.size), (rows, bounds.index[rows])), shape=(off.size, data))
+    return taken, np.where(off, none, bounds.constant)
+
+
+def _excess(sign: float, rows: tuple[Any, Any, np.ndarray], limit: tuple[Any, np.ndarray]) -> list[Any]:
+    """Blocks of rows that tell how far one side's bounds are exceeded."""
+    (G, H, g), (taken, constant) = rows, limit
+    there = np.isfinite(constant)
+    keep = sp.diags_array(sign * there)
+    excess = np.where(there, sign * (g - np.where(there, constant, 0.0)), -_MISSED)
+    return [keep @ G, None, keep @ (H - taken), excess[:, None]]
+
+
+def _joined(blocks: list[list[Any]], heights: list[int], widths: list[int], dense: bool) -> Matrix:
+    """A matrix of blocks, None for zeros."""
+    if not dense:
+        shapes = [[(height, width) for width in widths] for height in heights]
+        filled = [
+            [sp.csr_array(shape if block is None else block) for block, shape in zip(*row, strict=True)]
+            for row in zip(blocks, shapes, strict=True)
+        ]
+        return sp.block_array(filled, format="csr")
+    out = np.zeros((sum(heights), sum(widths)))
+    tops, lefts = np.cumsum([0, *heights]), np.cumsum([0, *widths])
+    for i, row in enumerate(blocks):
+        for j, block in enumerate(row):
+            if block is not None:
+                out[tops[i] : tops[i + 1], lefts[j] : lefts[j + 1]] = block.toarray() if sp.issparse(block) else block
+    return out
 
 
 def _linear(costs: list[Rows], flags: dict[str, np.ndarray | None], data: int) -> tuple[Matrix, np.ndarray]:

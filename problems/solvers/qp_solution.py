@@ -6,7 +6,6 @@ come from the terms, the data of that solve and the point.
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -44,7 +43,7 @@ class QPCheck:
         violation: largest violation of a bound where `map_` itself gave the answer, else None.
     """
 
-    __slots__ = ("__dict__", "_map", "_mu", "_numbers", "_program", "_store", "_violation", "_z")
+    __slots__ = ("_found", "_map", "_mu", "_numbers", "_program", "_store", "_violation", "_z")
 
     def __init__(
         self,
@@ -58,6 +57,7 @@ class QPCheck:
     ) -> None:
         self._program, self._store, self._numbers = program, store, numbers
         self._map, self._z, self._mu, self._violation = map_, z, mu, violation
+        self._found: tuple[np.ndarray, tuple[float, float, float]] | None = None
 
     @property
     def _rows(self) -> StackedRows:
@@ -66,29 +66,27 @@ class QPCheck:
             rows = self._map.rows = StackedRows(self._program, self._store.copy(self._numbers), self._map.flags)
         return rows
 
-    @cached_property
-    def _values(self) -> np.ndarray:
-        return self._rows.values(self._z, self._numbers)
+    def _optimality(self) -> tuple[np.ndarray, tuple[float, float, float]]:
+        """Multipliers of the equalities; ``primal``, ``dual`` and the absolute gap."""
+        if self._found is None:
+            rows = self._rows
+            values = rows.values(self._z, self._mu, self._numbers)
+            multipliers = rows.equality_multipliers(values)
+            self._found = multipliers, rows.residuals(values, self._mu, multipliers)
+        return self._found
 
-    @cached_property
-    def _gradient(self) -> np.ndarray:
-        """Of costs and active inequalities with respect to all unknowns."""
-        return self._rows.gradient(self._values, self._mu)
-
-    @cached_property
-    def _equality_multipliers(self) -> np.ndarray:
-        return self._rows.equality_multipliers(self._gradient)
+    def within(self, tolerance: float) -> bool:
+        """Whether all residuals are at most `tolerance` even without their sizes."""
+        primal, dual, gap = self._optimality()[1]
+        return primal <= tolerance and dual <= tolerance and gap <= tolerance
 
     def objective(self) -> float:
         return self._rows.objective(self._z, self._numbers)
 
     def residuals(self) -> dict[str, float]:
-        rows = self._rows
         if self._violation is not None and isinstance(self._map, DenseMap) and self._map.exact:
-            return rows.certified(self._map, self._numbers, self._violation)
-        primal, dual, gap = rows.residuals(
-            self._values, self._numbers, self._mu, self._gradient, self._equality_multipliers
-        )
+            return self._rows.certified(self._map, self._numbers, self._violation)
+        primal, dual, gap = self._optimality()[1]
         if gap > NEGLIGIBLE:
             gap /= max(1.0, abs(self.objective()))
         return {"primal": primal, "dual": dual, "gap": gap}
@@ -97,14 +95,15 @@ class QPCheck:
         rows = self._rows
         if self._mu is None and not rows.equalities:
             return {name: np.zeros(shape) for name, _, shape in rows.inequalities}
-        out = {name: self._equality_multipliers[part].reshape(shape) for name, part, shape in rows.equalities}
+        held = self._optimality()[0]
+        out = {name: held[part].reshape(shape) for name, part, shape in rows.equalities}
         for name, part, shape in rows.inequalities:
             out[name] = np.zeros(shape) if self._mu is None else self._mu[part].reshape(shape)
         return out
 
     def active_set(self) -> dict[str, np.ndarray]:
         rows = self._rows
-        active = rows.active(self._values, self._numbers, self._mu)
+        active = rows.active(self._z, self._numbers, self._mu)
         return {name: active[part].reshape(shape) for name, part, shape in rows.inequalities}
 
     def covariance(self, slots: tuple[Any, ...]) -> np.ndarray:

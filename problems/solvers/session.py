@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
@@ -67,6 +66,11 @@ class Solution:
         self.iterations = iterations
         self.message = message
         self.seconds: dict[str, float] = {}
+        # not `cached_property`, whose lock costs as much as what is kept
+        self._objective: float | None = None
+        self._residuals: dict[str, float] | None = None
+        self._multipliers: dict[str, np.ndarray] | None = None
+        self._active_set: dict[str, np.ndarray] | None = None
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self._layout.value(self.point, name)
@@ -80,24 +84,32 @@ class Solution:
     def solved(self) -> bool:
         return self.status is Status.SOLVED
 
-    @cached_property
+    @property
     def objective(self) -> float:
-        return self._check.objective()
+        if self._objective is None:
+            self._objective = self._check.objective()
+        return self._objective
 
-    @cached_property
+    @property
     def residuals(self) -> dict[str, float]:
         """``primal``, ``dual`` and ``gap``, recomputed here from the problem and the point."""
-        return self._check.residuals()
+        if self._residuals is None:
+            self._residuals = self._check.residuals()
+        return self._residuals
 
-    @cached_property
+    @property
     def multipliers(self) -> dict[str, np.ndarray]:
         """(count, dim) multipliers of every equality and inequality term; positive at an upper bound."""
-        return self._check.multipliers()
+        if self._multipliers is None:
+            self._multipliers = self._check.multipliers()
+        return self._multipliers
 
-    @cached_property
+    @property
     def active_set(self) -> dict[str, np.ndarray]:
         """(count, dim) of every inequality: 1 at the upper bound, -1 at the lower, 0 between."""
-        return self._check.active_set()
+        if self._active_set is None:
+            self._active_set = self._check.active_set()
+        return self._active_set
 
     def covariance(self, *slots: Variable | Slot) -> np.ndarray:
         """Joint covariance of the slots at the solution, in tangent coordinates (body frame), slot after slot.
@@ -176,9 +188,10 @@ class Session(ABC):
         if initial is not None:
             self._point = self.layout.point(initial, self._point)
         solution = self._solve()
-        spent = time.perf_counter() - start - sum(solution.seconds.values())
-        solution.seconds |= {"update": self._update_seconds, "solve": spent}
-        self._update_seconds = 0.0
+        seconds = solution.seconds
+        apart = sum(seconds.values()) if seconds else 0.0
+        seconds["update"], self._update_seconds = self._update_seconds, 0.0
+        seconds["solve"] = time.perf_counter() - start - apart
         if solution.status in _USABLE:
             self._point = solution.point
         return solution
