@@ -282,12 +282,12 @@ class WholeCosts:
         self.costs, self.pattern, self.source = costs, pattern, _Source(layout, costs)
         known = self.source.free - layout.stored_size
         instances = sum(cost.count for cost in costs)
-        x, p = ca.SX.sym("x", layout.stored_size), ca.SX.sym("p", known + instances)
-        everything = ca.vertcat(x, p[:known], ca.SX(self.source.constants))
-        outputs, value, at = [], ca.SX(0), known
+        x, data, flags = ca.SX.sym("x", layout.stored_size), ca.SX.sym("d", known), ca.SX.sym("on", instances)
+        p, everything = ca.vertcat(data, flags), ca.vertcat(x, data, ca.SX(self.source.constants))
+        outputs, value, at = [], ca.SX(0), 0
         for cost, index in zip(costs, self.source.inputs, strict=True):
             given = ca.reshape(everything[index.ravel().tolist()], index.shape[1], cost.count)
-            on = p[at : at + cost.count].T
+            on = flags[at : at + cost.count].T
             found = cost.kernel(switched=True).code.function(ca.vertcat(given, on))
             value += ca.sum2(found[0, :])
             outputs.append(ca.vec(found))

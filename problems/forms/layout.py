@@ -15,7 +15,7 @@ import numpy as np
 from problems.errors import DataError, EmptyConstraintError, ShapeError, UnknownNameError
 from problems.noise import whitening
 from problems.problem import Data, DataSlot, Problem, Slot, Term
-from problems.spaces import points
+from problems.spaces import Vector, points
 
 INFINITE = 1e20  # stands for an infinite bound given as data, where 0 * inf must not become NaN
 
@@ -157,6 +157,7 @@ class Layout:
             block += variable.count
             dims.append(np.full(variable.count, variable.space.dim))
         self.stored_size, self.size = stored, tangent
+        self._flat = all(isinstance(variable.space, Vector) for variable in problem.unknowns.values())
         self.block_dims = np.concatenate(dims) if dims else np.zeros(0, int)
         self.block_columns = np.concatenate([[0], np.cumsum(self.block_dims)]).astype(np.intp)
         self.data_start: dict[str, int] = {}
@@ -255,6 +256,8 @@ class Layout:
 
     def retract(self, point: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The point moved by a tangent step."""
+        if self._flat:
+            return point + step
         out = np.empty_like(point)
         for name, variable in self.problem.unknowns.items():
             s, t = self.stored_start[name], self.start[name]

@@ -53,6 +53,12 @@ class HessianPattern:
     def nonzeros(self) -> int:
         return int(self.indptr[-1])
 
+    @property
+    def bandwidth(self) -> int:
+        """Entries above the diagonal in the longest column, zeros between them included."""
+        height = np.arange(self.size) - self.indices[self.indptr[:-1]]
+        return int(height.max(initial=0))
+
     @cached_property
     def work(self) -> float:
         """Operations of a factorization in an approximate minimum degree order of the variable instances."""

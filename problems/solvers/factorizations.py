@@ -16,16 +16,17 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from scipy.linalg.lapack import dpotrf, dpotrs  # type: ignore[attr-defined]
+from scipy.linalg.lapack import dpbtrf, dpbtrs, dpotrf, dpotrs  # type: ignore[attr-defined]
 
 from problems.errors import MissingExtraError
 from problems.forms.sparsity import HessianPattern
 
 DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
+BAND_WIDTH = 32  # entries above the diagonal up to which banded Cholesky is faster, if it is much less than all
 BLOCK_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
 HEAVY_WORK = 2e7  # the same for Pardiso, whose import takes a second once
 
-LinearSolver = Literal["auto", "dense", "qdldl", "superlu", "pardiso", "cholmod", "schur"]
+LinearSolver = Literal["auto", "dense", "banded", "qdldl", "superlu", "pardiso", "cholmod", "schur"]
 
 
 class SingularError(ArithmeticError):
@@ -68,6 +69,33 @@ class DenseCholesky:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         return dpotrs(self._factor, right, lower=0)[0]
+
+
+class BandedCholesky:
+    """LAPACK Cholesky of a band: for chains, such as the states of a window, in the order of time."""
+
+    name: ClassVar[str] = "banded"
+
+    def __init__(self, pattern: HessianPattern) -> None:
+        columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+        self._width = pattern.bandwidth
+        self._flat = columns * (self._width + 1) + self._width + pattern.indices - columns
+        self._band = np.zeros((self._width + 1) * pattern.size)
+        # its transpose is what LAPACK reads by columns
+        self._matrix = self._band.reshape(pattern.size, self._width + 1).T
+        self._factor: Any = None
+
+    def factor(self, values: np.ndarray) -> None:
+        self._band[self._flat] = values
+        self._factor, info = dpbtrf(self._matrix)
+        if info != 0:
+            raise SingularError(f"leading minor {info} is not positive")
+        diagonal = self._factor[self._width]
+        if not diagonal.dot(diagonal) < np.inf:
+            raise SingularError("the matrix is not finite")
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        return dpbtrs(self._factor, right)[0]
 
 
 class SparseLDL:
@@ -218,7 +246,7 @@ class CHOLMOD:
 
 
 CLASSES: dict[str, type[Factorization]] = {
-    cls.name: cls for cls in (DenseCholesky, SparseLDL, SuperLU, Pardiso, CHOLMOD)
+    cls.name: cls for cls in (DenseCholesky, BandedCholesky, SparseLDL, SuperLU, Pardiso, CHOLMOD)
 }
 
 
@@ -229,7 +257,9 @@ def factorization(pattern: HessianPattern, solver: LinearSolver = "auto") -> Fac
         MissingExtraError: its package is not installed.
     """
     if solver == "auto":
-        if pattern.size <= DENSE_SIZE:
+        if pattern.bandwidth <= min(BAND_WIDTH, pattern.size // 4):
+            solver = "banded"
+        elif pattern.size <= DENSE_SIZE:
             solver = "dense"
         elif pattern.work >= HEAVY_WORK and find_spec("pypardiso") is not None:
             solver = "pardiso"

@@ -54,9 +54,9 @@ class Settings:
         iterations: exact number of steps without convergence test (real-time iteration); None iterates to convergence.
         screen: answer steps that satisfy the linearized constraints by the linear solve; else the QP backend is always
             called.
-        linear_solver: factorization of the normal equations: ``dense``, ``qdldl``, ``superlu``, ``pardiso`` (extra
-            ``pardiso``), ``cholmod`` (extra ``gpl``), ``schur`` (few poses, many landmarks), or ``auto``: by size, work
-            and what is installed.
+        linear_solver: factorization of the normal equations: ``dense``, ``banded`` (chains in order), ``qdldl``,
+            ``superlu``, ``pardiso`` (extra ``pardiso``), ``cholmod`` (extra ``gpl``), ``schur`` (few poses, many
+            landmarks), or ``auto``: by size, band, work and what is installed.
         graduated: graduated non-convexity: come to the robust losses from wider ones, past local minima of outliers.
     """
 
@@ -88,7 +88,7 @@ class GaussNewton(Session):
         pattern = self.form_.pattern
         self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._linear = factorization(pattern, self.settings.linear_solver)
-        self.sparse = pattern.size > DENSE_SIZE
+        self.sparse = pattern.size > DENSE_SIZE and self._linear.name != "banded"
         self.heavy = self.sparse and pattern.work >= HEAVY_WORK
         rungs = ladder(problem) if self.settings.graduated else []
         self._known_gauge: tuple[bytes, str] | None = None
@@ -256,22 +256,24 @@ class _Search:
         session = self.session
         session.pins.reduce(gradient, hessian, session.form_.pattern)
         self.hessian = hessian
-        violation = self._violation(self.point)
+        violation, largest = self._violation(self.point)
         kept = None if forced else self._kept_step(cost, gradient, hessian, tolerance)
         while True:
             damped = hessian
             if self.damping > 0:
                 damped = hessian.copy()
-                damped[self.diagonal] += self.damping * np.maximum(hessian[self.diagonal], 1e-12)
-            step = np.full(gradient.size, np.nan)
+                pull = self.damping * np.maximum(hessian[self.diagonal], 1e-12)
+                damped[self.diagonal] += pull
             try:
                 if kept is not None:
                     step = kept
                 elif session.settings.screen:
                     session._linear.factor(damped)
                     step = -session._linear.solve(gradient)
-                    if not np.isfinite(step).all():
+                    if not step.dot(step) < np.inf:
                         raise SingularError("no finite step")
+                else:
+                    step = np.full(gradient.size, np.nan)
             except SingularError as error:
                 if self.damping == 0 and not session.constraints.size:
                     free = self.layout.names_of((hessian[self.diagonal] <= 0).astype(float))
@@ -286,8 +288,8 @@ class _Search:
                 if failed is not None:
                     return failed
             if kept is None and not session.constraints.size and session.settings.screen:
-                pull = self.damping * np.maximum(hessian[self.diagonal], 1e-12) @ step**2
-                decrease = (float(pull) - float(gradient @ step)) / 2  # as the step solves the damped system
+                # as the step solves the damped system
+                decrease = (float(pull @ step**2 if self.damping > 0 else 0.0) - float(gradient @ step)) / 2
             else:
                 decrease = self._decrease(gradient, hessian, step)
             small = abs(decrease) <= tolerance * max(1.0, cost) and self.damping <= DAMPING_START
@@ -298,20 +300,20 @@ class _Search:
             # an undamped step is nearly always taken, and its linearization gives the cost as well
             ahead = None if small or self.damping > 0 else self.bound.linearize(trial)
             new = self.bound.cost(trial) if ahead is None else ahead[0]
-            new_violation = self._violation(trial)
+            new_violation, new_largest = self._violation(trial)
             if session.constraints.size:
                 self.penalty = max(self.penalty, 2 * float(np.abs(self.multipliers).max(initial=0.0)))
-            merit = cost + self.penalty * violation.sum()
-            new_merit = new + self.penalty * new_violation.sum()
-            if np.isfinite(new_merit) and new_merit <= merit + 1e-14 * abs(merit):
+            merit = cost + self.penalty * violation
+            new_merit = new + self.penalty * new_violation
+            if new_merit <= merit + 1e-14 * abs(merit) and new_merit > -np.inf:
                 self.point, self.ahead = trial, ahead
                 near = cost - new <= NEAR * max(1.0, cost) and self.damping == 0 and not session.constraints.size
                 self.gained = cost - new if near else None
                 self.damping = self.damping / 10 if self.damping > 1e-9 else 0.0
-                if small and new_violation.max(initial=0.0) <= self.options.tolerance * 10:
+                if small and new_largest <= self.options.tolerance * 10:
                     return Status.SOLVED, ""
                 return None
-            if small and violation.max(initial=0.0) <= self.options.tolerance * 10:
+            if small and largest <= self.options.tolerance * 10:
                 return Status.SOLVED, ""  # no descent left above rounding
             if kept is not None:
                 kept = None
@@ -361,9 +363,11 @@ class _Search:
         products = hessian * step[self.session.hessian_columns] * step[pattern.indices]
         return float(2 * products.sum() - products[self.diagonal].sum())
 
-    def _violation(self, point: np.ndarray) -> np.ndarray:
+    def _violation(self, point: np.ndarray) -> tuple[float, float]:
+        """Sum and largest of what the rows of the constraints miss."""
         constraints = self.session.constraints
         if not constraints.size:
-            return np.zeros(0)
+            return 0.0, 0.0
         values = constraints.residual(point, self.numbers, self.bound.flags)
-        return np.maximum(np.maximum(values - self.upper, self.lower - values), 0.0)
+        missed = np.maximum(np.maximum(values - self.upper, self.lower - values), 0.0)
+        return float(missed.sum()), float(missed.max())

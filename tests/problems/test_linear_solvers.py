@@ -13,7 +13,7 @@ from problems import SE2, SE3, Gaussian, Problem, Vector
 from problems.errors import MissingExtraError, SettingError
 from problems.solvers import factorizations
 
-SOLVERS = ["dense", "qdldl", "superlu", "pardiso", "cholmod"]
+SOLVERS = ["dense", "banded", "qdldl", "superlu", "pardiso", "cholmod"]
 PACKAGES = {"pardiso": "pypardiso", "cholmod": "cvxopt"}
 
 
@@ -87,8 +87,13 @@ def test_auto_goes_by_size_and_work(monkeypatch: pytest.MonkeyPatch) -> None:
         session: Any = problem.compile("gauss-newton", whole=False)
         return session._linear.name
 
-    assert chosen(chain(SE2, 40)) == "dense"
-    assert chosen(chain(SE2, 60)) == "qdldl"
+    assert chosen(chain(SE2, 40)) == "banded"
+    assert chosen(chain(SE2, 1000)) == "banded"
+    for count, name in ((40, "dense"), (60, "qdldl")):
+        closed = chain(SE2, count)
+        x = closed.unknowns["x"]
+        closed.cost("last", lambda a, b: a.between(b).local(), (x[0], x[count - 1]))
+        assert chosen(closed) == name
     dense = chain(Vector(6), 60, all_pairs=True)
     assert factorizations.DENSE_SIZE < 360
     monkeypatch.setattr(factorizations, "HEAVY_WORK", work(dense))
