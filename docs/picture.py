@@ -14,7 +14,7 @@ from matplotlib.patches import Ellipse
 from localization import measurements as meas
 from mhe import Polyhedron, mhe
 from problems import SE2, Gaussian, LinearModel, Problem, Sensor, simulate
-from problems.display import figure
+from problems.display import new_figure
 
 COLOURS = {"osqp": "#d55e00", "proxqp": "#009e73", "piqp": "#cc79a7", "daqp": "#0072b2"}
 MARKERS = {"osqp": "o", "proxqp": "s", "piqp": "^", "daqp": "D"}
@@ -97,7 +97,7 @@ def draw_solvers(axes) -> None:
 
 
 if __name__ == "__main__":
-    drawing = figure(figsize=(11, 5.2), layout="constrained")
+    drawing = new_figure(figsize=(11, 5.2), layout="constrained")
     left, right = drawing.subplots(1, 2)
     draw_team(left)
     draw_solvers(right)

@@ -11,6 +11,7 @@ from localization.ellipses import draw_ellipses
 from localization.io.recording import PoseGraph, TeamRecording
 from localization.io.scoring import align
 from localization.plots import COLORS, MARKERS, STYLES
+from problems.display import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,10 +32,8 @@ def plot_graph(graph: PoseGraph, traces: Mapping[str, GraphTrace]) -> Figure:
     Args:
         traces: by label, the first one with start, ellipses and worst measurements.
     """
-    from matplotlib.figure import Figure
-
     spatial, scored = graph.dimension == 3, graph.truth is not None
-    figure = Figure(figsize=(13 if spatial else 10, 10 if scored else 8), layout="constrained")
+    figure = new_figure(figsize=(13 if spatial else 10, 10 if scored else 8), layout="constrained")
     rows = figure.subfigures(2, 1, height_ratios=[3, 1]) if scored else [figure]
     views = rows[0].subplots(1, 2 if spatial else 1, squeeze=False)[0]
     for axes, plane in zip(views, ((0, 1), (0, 2)), strict=False):
@@ -147,10 +146,8 @@ def plot_team_tracks(recording: TeamRecording, traces: Mapping[str, Any]) -> Fig
     Args:
         traces: `localization.tracking.team_tracker.TeamTrack` by label; the first one is drawn.
     """
-    from matplotlib.figure import Figure
-
     label, made = next(iter(traces.items()))
-    figure = Figure(figsize=(10, 10), layout="constrained")
+    figure = new_figure(figsize=(10, 10), layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=[3, 1])
     for r, robot in enumerate(recording.robots):
         color, xy = COLORS[r % len(COLORS)], made.poses[:, r, :2]

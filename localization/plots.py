@@ -11,6 +11,7 @@ from localization.ellipses import draw_ellipses
 from localization.io.recording import UwbRecording
 from localization.lattice import Fence, Measurements
 from localization.tracking.range_tracker import Track
+from problems.display import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,10 +30,8 @@ def plot_tracks(recording: UwbRecording, tracks: Mapping[str, Track]) -> Figure:
     Args:
         tracks: by label.
     """
-    from matplotlib.figure import Figure
-
     truth = recording.truth
-    figure = Figure(figsize=(10, 8 if truth is not None else 5.5), layout="constrained")
+    figure = new_figure(figsize=(10, 8 if truth is not None else 5.5), layout="constrained")
     if truth is not None:
         above, below = figure.subplots(2, 1, height_ratios=[2, 1])
         above.plot(truth.value[:, 0], truth.value[:, 1], color="0.6", lw=4, label="truth", solid_capstyle="round")
@@ -87,11 +86,9 @@ def plot_team(
         estimates: by label, positions (n, 2) or poses (n, 3), and covariances (n, 2, 2) of the positions or None.
         fence: lowest and highest position (2,), m.
     """
-    from matplotlib.figure import Figure
-
     truth = team.truth
     assert truth is not None
-    figure = Figure(figsize=(13, 7.5), layout="constrained")
+    figure = new_figure(figsize=(13, 7.5), layout="constrained")
     above, beside = figure.subplots(1, 2, width_ratios=[1.9, 1])
     ends = truth[np.column_stack([team.observer, team.target]), :2]
     gap = np.full((len(ends), 1, 2), np.nan)

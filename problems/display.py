@@ -60,7 +60,7 @@ def shown(value: Any) -> str:
     return "" if value is None else str(value)
 
 
-def figure(**options: Any) -> Figure:
+def new_figure(**options: Any) -> Figure:
     """An empty ``matplotlib.figure.Figure``, outside of pyplot's bookkeeping.
 
     Args:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from problems.display import figure
+from problems.display import new_figure
 from problems.forms.layout import Layout
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def plot_structure(problem: Problem) -> Figure:
     if not problem.unknowns or not problem.terms:
         raise DefinitionError(f"problem {problem.name!r} has no variables or no terms yet; there is nothing to draw")
     layout = Layout(problem)
-    drawing = figure(figsize=(11, 5), layout="constrained")
+    drawing = new_figure(figsize=(11, 5), layout="constrained")
     left, right = drawing.subplots(1, 2)
     _draw_graph(left, problem, layout)
     _draw_sparsity(right, problem, layout)

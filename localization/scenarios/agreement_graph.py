@@ -12,6 +12,7 @@ import pydantic
 from localization import measurements as meas
 from problems.bench.agreement import METRICS, Case, Optimum, certified_optima, compared
 from problems.bench.scenario import Outcome
+from problems.display import new_figure
 from problems.noise import Cauchy, Gaussian, GemanMcClure, Huber, Loss
 from problems.problem import Problem
 from problems.spaces import SE2
@@ -107,9 +108,7 @@ class AgreementGraphScenario:
         return outcome
 
     def plot(self, settings: Settings, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(6.0, 6.0), layout="constrained")
+        figure = new_figure(figsize=(6.0, 6.0), layout="constrained")
         axes = figure.subplots()
         axes.plot(*drawn.truth[:, :2].T, color="#000000", linewidth=1.6, label="truth")
         for label, outcome in outcomes.items():

@@ -13,6 +13,7 @@ import pydantic
 from localization.consensus.campaign import LOSSY, Campaign, run_campaign
 from localization.consensus.relative import RelativeVectors, measure_differences, optimum
 from problems.bench.scenario import Outcome
+from problems.display import new_figure
 from problems.networks import random_geometric
 
 if TYPE_CHECKING:
@@ -93,9 +94,8 @@ class RelativeNetworkScenario:
 
     def plot(self, settings: Settings, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
         from matplotlib.collections import LineCollection
-        from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(14, 4.8), layout="constrained")
+        figure = new_figure(figsize=(14, 4.8), layout="constrained")
         graph, over, per = figure.subplots(1, 3, width_ratios=[1, 1.3, 1.3])
         graph.add_collection(LineCollection(list(drawn.places[drawn.vectors.network.edges]), colors="0.75", lw=0.8))
         graph.plot(*drawn.places.T, "o", ms=4, color="black")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mhe.scenarios.sensor_field_world import SensorField
-from problems.display import figure
+from problems.display import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ def plot(field: SensorField, curves: Mapping[str, np.ndarray], states: np.ndarra
         states: (steps, 4) of the target.
         threshold: of convergence (m).
     """
-    shown = figure(figsize=(13, 5.8), layout="constrained")
+    shown = new_figure(figsize=(13, 5.8), layout="constrained")
     left, right = shown.subplots(1, 2, width_ratios=(1.15, 1))
     draw_prmse(left, curves, threshold)
     draw_network(right, field, states)

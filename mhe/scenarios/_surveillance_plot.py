@@ -13,6 +13,7 @@ import shapely
 
 from mhe.scenarios._surveillance_metrics import error_norms, over_nodes
 from mhe.scenarios._surveillance_world import Drawn, World
+from problems.display import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,7 +109,6 @@ def plot(world: World, drawn: Drawn, estimates: Mapping[str, np.ndarray], instan
         estimates: (instants, n_S, n_V, 2) by label.
         instants: which ones are drawn.
     """
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     instants = list(instants) or chosen_instants(drawn)
@@ -116,7 +116,7 @@ def plot(world: World, drawn: Drawn, estimates: Mapping[str, np.ndarray], instan
     tall = (y1 - y0 + 2 * MARGIN) / (x1 - x0 + 2 * MARGIN)
     columns = len(instants)
     heights = 2.9 * tall + 0.4, 2.9 + 0.4, 1.6 if drawn.positions is None else 5.6
-    figure = Figure(figsize=(max(3.1 * columns, 8.0), sum(heights) + 0.5), layout="constrained")
+    figure = new_figure(figsize=(max(3.1 * columns, 8.0), sum(heights) + 0.5), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=(heights[0] + heights[1], heights[2]))
     panels = upper.subplots(2, columns, squeeze=False, height_ratios=(heights[0], heights[1]))
     for column, k in enumerate(instants):

@@ -18,6 +18,7 @@ from mhe.polyhedron import Polyhedron
 from mhe.window import Window, WindowForm
 from problems.bench.agreement import METRICS, Case, Optimum, certified_optima, compared
 from problems.bench.scenario import Outcome
+from problems.display import new_figure
 from problems.models import LinearModel, Sensor
 
 if TYPE_CHECKING:
@@ -98,9 +99,7 @@ class AgreementWindowScenario:
         return compared(session, drawn.cases, drawn.optima, "x")
 
     def plot(self, settings: Settings, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(8.0, 4.0), layout="constrained")
+        figure = new_figure(figsize=(8.0, 4.0), layout="constrained")
         axes = figure.subplots()
         first = settings.windows - 1
         axes.plot(*drawn.states[first:, :2].T, color="#000000", linewidth=1.6, label="truth")

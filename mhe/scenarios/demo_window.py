@@ -23,6 +23,7 @@ from mhe.estimate import Estimate, WindowEstimate
 from mhe.filters import KalmanFilter
 from mhe.polyhedron import Polyhedron
 from problems.bench.scenario import Consistency, Curve, Outcome
+from problems.display import new_figure
 from problems.errors import ModelWarning
 from problems.models import LinearModel, Sensor
 
@@ -142,9 +143,7 @@ class DemoWindowScenario:
         return drawn.references[method]
 
     def plot(self, settings: Settings, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(8.0, 6.4), layout="constrained")
+        figure = new_figure(figsize=(8.0, 6.4), layout="constrained")
         panels = figure.subplots(3, 1, sharex=True)
         for k, (axes, name) in enumerate(zip(panels, _model().state_names, strict=True)):
             axes.plot(drawn.states[:, k], color="#000000", linewidth=1.6, label="truth")

@@ -13,6 +13,7 @@ import numpy as np
 from problems.bench.curves import Band, Claim
 from problems.bench.scenario import DISTANCE
 from problems.bench.summary import TRADE_OFFS, Summary
+from problems.display import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -183,9 +184,7 @@ def profile(profiles: Mapping[str, tuple[np.ndarray, np.ndarray]], prefix: str) 
 
 
 def _figure() -> tuple[Figure, Axes]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    figure = new_figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.add_subplot()
     axes.grid(True, which="major", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
