@@ -389,10 +389,9 @@ def test_15_unknowns_of_a_local_problem(horizon: int) -> None:
 
 @pytest.mark.parametrize("method", ["dmhe_l_pre", "dmhe_1_pre", "dmhe_b"])
 def test_15_batched_equals_node_by_node(method: str) -> None:
-    x, y = trials()
     # both in the form that keeps the digits of vanishing arrival weights
-    options = {"form": "F3"} if method == "dmhe_b" else {}
-    together = run_relay_trials(design_of(method, **options), y).states
+    options: dict[str, Any] = {"form": "F3"} if method == "dmhe_b" else {}
+    together = run_relay_trials(design_of(method, **options), trials()[1]).states
     alone = run(method, **options)
     assert np.abs(together[0] - alone).max() < 1e-10 * np.abs(alone).max()
 
