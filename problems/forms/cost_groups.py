@@ -8,11 +8,13 @@ whole problem as one function saves the loop's copies but takes its time to comp
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg.lapack import dpotrf  # type: ignore[attr-defined]
 
 from problems.forms.kernels import CostKernel, cost_kernel
 from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, noise_numbers
@@ -25,14 +27,34 @@ Flags = Mapping[str, np.ndarray | None]  # active instances (count,) by term; No
 Linearization = tuple[float, np.ndarray, np.ndarray]  # cost, gradient, Hessian entries in the order of the pattern
 
 
+def _single_root(matrix: np.ndarray) -> np.ndarray | None:
+    """Upper triangle of the Cholesky factor of one information matrix; None where it needs a closer look."""
+    skew = (matrix - matrix.T).ravel()
+    root, info = dpotrf(matrix, lower=0)
+    if info != 0 or not skew.dot(skew) <= (1e-8 * matrix[0, 0]) ** 2:
+        return None
+    return root[_upper(len(matrix))][:, None]
+
+
+@cache
+def _upper(dim: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.triu_indices(dim)
+
+
 def whitening_numbers(entry: TermLayout, dim: int, store: DataStore) -> np.ndarray:
     """Whitening of a cost as kernel inputs: (dim or dim(dim+1)/2, 1 or count)."""
     noise = entry.term.noise
     assert noise is not None
+    if noise.kind == "information" and isinstance(noise.value, DataSlot) and len(noise.value.indices) == 1:
+        rows = store[noise.value.source.name]
+        if rows.shape[1] == dim * dim and dim > 1:
+            root = _single_root(rows[noise.value.indices[0]].reshape(dim, dim))
+            if root is not None:
+                return root
     root = whitening(noise.kind, noise_numbers(entry.term, dim, store), dim, entry.term.count, entry.term.what)
     if root.ndim == 2:
         return root.T
-    a, b = np.triu_indices(dim)
+    a, b = _upper(dim)
     return root[:, a, b].T
 
 
@@ -165,7 +187,7 @@ class _Source:
 
     def __init__(self, layout: Layout, costs: Sequence[Cost]) -> None:
         constants: list[np.ndarray] = []
-        self.size = layout.stored_size + layout.data_size
+        self.start, self.size = layout.stored_size, layout.stored_size + layout.data_size
         self._dynamic = [cost for cost in costs if cost.dynamic]
         whitenings: dict[int, np.ndarray] = {}
         for cost in self._dynamic:
@@ -191,15 +213,15 @@ class _Source:
             self.inputs.append(np.hstack([np.broadcast_to(part, (cost.count, part.shape[1])) for part in parts]))
         self.constants = np.concatenate([np.zeros(0), *constants])
 
-    def parameters(self, store: DataStore, numbers: np.ndarray) -> np.ndarray:
-        """What follows the point and can change: data and whitenings made of data."""
-        if not self._dynamic:
-            return numbers
-        parts = [numbers]
+    def write(self, out: np.ndarray, store: DataStore, numbers: np.ndarray) -> None:
+        """Data and whitenings made of data, the first entries of `out`."""
+        out[: numbers.size] = numbers
+        at = numbers.size
         for cost in self._dynamic:
             white = cost.whitening(store)
-            parts.append(np.broadcast_to(white, (white.shape[0], cost.count)).T.ravel())
-        return np.concatenate(parts)
+            size = white.shape[0] * cost.count
+            out[at : at + size].reshape(cost.count, white.shape[0])[:] = white.T
+            at += size
 
 
 class MappedCosts:
@@ -240,7 +262,9 @@ class MappedCosts:
         return np.flatnonzero(every), np.flatnonzero(single)
 
     def bind(self, store: DataStore, numbers: np.ndarray, flags: Flags) -> _BoundMapped:
-        return _BoundMapped(self, self.source.parameters(store, numbers), flags)
+        parameters = np.empty(self.source.free - self.source.start)
+        self.source.write(parameters, store, numbers)
+        return _BoundMapped(self, parameters, flags)
 
 
 class _BoundMapped:
@@ -280,7 +304,7 @@ class WholeCosts:
 
     def __init__(self, layout: Layout, costs: Sequence[Cost], pattern: HessianPattern) -> None:
         self.costs, self.pattern, self.source = costs, pattern, _Source(layout, costs)
-        known = self.source.free - layout.stored_size
+        known = self.source.free - self.source.start
         instances = sum(cost.count for cost in costs)
         x, data, flags = ca.SX.sym("x", layout.stored_size), ca.SX.sym("d", known), ca.SX.sym("on", instances)
         p, everything = ca.vertcat(data, flags), ca.vertcat(x, data, ca.SX(self.source.constants))
@@ -303,21 +327,25 @@ class WholeCosts:
         self._linearize = _buffered(ca.Function("sums", [x, p], [sums]), [self._x, self._p], self._sums)
 
     def bind(self, store: DataStore, numbers: np.ndarray, flags: Flags) -> _BoundWhole:
-        parts = [self.source.parameters(store, numbers)]
+        parameters = np.ones(self._p.size)
+        self.source.write(parameters, store, numbers)
+        at = self.source.free - self.source.start
         for cost in self.costs:
             on = flags[cost.term.name]
-            parts.append(np.ones(cost.count) if on is None else on)
-        return _BoundWhole(self, np.concatenate(parts))
+            if on is not None:
+                parameters[at : at + cost.count] = on
+            at += cost.count
+        return _BoundWhole(self, parameters)
 
     def cost(self, point: np.ndarray, parameters: np.ndarray) -> float:
         self._x[:] = point
-        self._p[: parameters.size] = parameters
+        self._p[:] = parameters
         self._evaluate()
         return float(self._value[0])
 
     def linearize(self, point: np.ndarray, parameters: np.ndarray) -> Linearization:
         self._x[:] = point
-        self._p[: parameters.size] = parameters
+        self._p[:] = parameters
         self._linearize()
         sums, size = self._sums.copy(), self.pattern.size
         return float(sums[0]), sums[1 : 1 + size], sums[1 + size :]

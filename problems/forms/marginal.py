@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg.lapack import dpotrf, dtrtrs  # type: ignore[attr-defined]
 
 from problems.errors import DefinitionError, UnobservableError
 from problems.forms.layout import DataStore, Layout
@@ -138,7 +139,9 @@ class NonlinearMarginal:
         self._form = LeastSquares(part.problem, part.layout)
         self._constraints = Constraints(part.layout)
         pattern, size = self._form.pattern, part.layout.size
-        rows, columns = pattern.indices, np.repeat(np.arange(size), np.diff(pattern.indptr))
+        place = np.empty(size, np.intp)  # dropped unknowns first, then the kept ones in their order
+        place[self.plan.columns] = np.arange(size)
+        rows, columns = place[pattern.indices], place[np.repeat(np.arange(size), np.diff(pattern.indptr))]
         self._upper, self._lower = rows * size + columns, columns * size + rows
 
     def __call__(self, store: DataStore, point: np.ndarray) -> Marginal:
@@ -146,13 +149,32 @@ class NonlinearMarginal:
         bound = self._form.bind(store)
         at = point[plan.part.stored]
         _, gradient, entries = bound.linearize(at)
-        H = np.zeros(size * size)
-        H[self._upper] = H[self._lower] = entries
-        order = plan.columns
-        values, jacobian = self._constraints.evaluate(at, bound.numbers, bound.flags)
-        shape = (self._constraints.size, size)
-        F = sp.coo_array((jacobian, (self._constraints.rows, self._constraints.columns)), shape=shape).toarray()
-        M, linear = schur(
-            H.reshape(size, size)[np.ix_(order, order)], gradient[order, None], F[:, order], values[:, None], plan.drop
-        )
-        return Marginal(tuple(plan.slots), M, -linear[:, 0], plan.references(point))
+        H = np.empty((size, size)) if entries.size == size * (size + 1) // 2 else np.zeros((size, size))
+        flat, order = H.ravel(), plan.columns
+        flat[self._upper] = flat[self._lower] = entries
+        gradient = gradient[order]
+        found = None if self._constraints.size else _definite(H, gradient, plan.drop)
+        if found is None:
+            values, jacobian = self._constraints.evaluate(at, bound.numbers, bound.flags)
+            shape = (self._constraints.size, size)
+            F = sp.coo_array((jacobian, (self._constraints.rows, self._constraints.columns)), shape=shape).toarray()
+            M, linear = schur(H, gradient[:, None], F[:, order], values[:, None], plan.drop)
+            found = M, linear[:, 0]
+        return Marginal(tuple(plan.slots), found[0], -found[1], plan.references(point))
+
+
+def _definite(H: np.ndarray, gradient: np.ndarray, drop: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """`schur` without equalities by Cholesky; None where the dropped part is not well definite."""
+    diagonal = H.diagonal()[:drop]
+    if not drop or not diagonal.min() > 0:
+        return None
+    scale = 1 / np.sqrt(diagonal)
+    root, info = dpotrf(H[:drop, :drop] * (scale[:, None] * scale), lower=1)
+    # the smallest pivot of a matrix with unit diagonal bounds its condition well enough to leave doubtful ones alone
+    if info != 0 or not root.diagonal().min() > 1e-4:
+        return None
+    right = np.empty((drop, H.shape[0] - drop + 1))
+    right[:, :-1], right[:, -1] = H[:drop, drop:], gradient[:drop]
+    carried = dtrtrs(root, scale[:, None] * right, lower=1)[0]
+    cross = carried[:, :-1]
+    return H[drop:, drop:] - cross.T @ cross, gradient[drop:] - cross.T @ carried[:, -1]
