@@ -34,7 +34,7 @@ def plot_graph(graph: PoseGraph, traces: Mapping[str, GraphTrace]) -> Figure:
     """
     spatial, scored = graph.dimension == 3, graph.truth is not None
     figure = new_figure(figsize=(13 if spatial else 10, 10 if scored else 8), layout="constrained")
-    rows = figure.subfigures(2, 1, height_ratios=[3, 1]) if scored else [figure]
+    rows: Any = figure.subfigures(2, 1, height_ratios=[3, 1]) if scored else [figure]
     views = rows[0].subplots(1, 2 if spatial else 1, squeeze=False)[0]
     for axes, plane in zip(views, ((0, 1), (0, 2)), strict=False):
         _draw_view(axes, graph, traces, plane)

@@ -117,7 +117,8 @@ def plot(world: World, drawn: Drawn, estimates: Mapping[str, np.ndarray], instan
     columns = len(instants)
     heights = 2.9 * tall + 0.4, 2.9 + 0.4, 1.6 if drawn.positions is None else 5.6
     figure = new_figure(figsize=(max(3.1 * columns, 8.0), sum(heights) + 0.5), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(heights[0] + heights[1], heights[2]))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(heights[0] + heights[1], heights[2]))
+    upper, lower = parts
     panels = upper.subplots(2, columns, squeeze=False, height_ratios=(heights[0], heights[1]))
     for column, k in enumerate(instants):
         for row in (0, 1):
@@ -125,7 +126,7 @@ def plot(world: World, drawn: Drawn, estimates: Mapping[str, np.ndarray], instan
     for row in (0, 1):
         panels[row, 0].set_ylabel("y (m)", fontsize=8)
     handles, labels = panels[1, 0].get_legend_handles_labels()
-    dots = {"linestyle": "none", "color": "#555555"}
+    dots: dict[str, Any] = {"linestyle": "none", "color": "#555555"}
     handles += [
         Line2D([], [], marker=".", markersize=4, **dots),
         Line2D([], [], marker="+", markersize=6, **dots),
