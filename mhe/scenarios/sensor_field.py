@@ -163,7 +163,7 @@ class SensorFieldScenario:
 
     def plot(self, settings: Settings, drawn: FieldTrial, outcomes: Mapping[str, Outcome]) -> Figure:
         """PRMSE over time, logarithmic, and the network with the way of the target."""
-        from mhe.scenarios._sensor_field_plot import plot
+        from mhe.scenarios.sensor_field_plot import plot
 
         curves = {label: outcome.trace.errors.mean(axis=1) for label, outcome in outcomes.items()}
         return plot(self.field(settings), curves, drawn.states, settings.threshold)
