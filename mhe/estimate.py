@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from problems.display import Table
+from problems.errors import UnobservableError
 from problems.solvers.base import Status
 
 if TYPE_CHECKING:
@@ -48,8 +50,9 @@ class Estimate:
     def table(self) -> Table:
         """States with their standard deviations."""
         deviations: list[Any] = [None] * len(self.state_names)
-        if self.covariance is not None:
-            deviations = np.sqrt(np.diag(self.covariance)).tolist()
+        with suppress(UnobservableError):  # there may be none yet, which is no reason not to show the rest
+            if self.covariance is not None:
+                deviations = np.sqrt(np.diag(self.covariance)).tolist()
         notes = [f"{self.seconds * 1e6:.0f} us"]
         notes += [f"not met: {', '.join(self.infeasible)}"] if self.infeasible else []
         notes += [f"{len(self.missing)} missing"] if self.missing else []

@@ -73,7 +73,7 @@ class TestProtocol:
         assert estimate.missing == (0, 1) and estimate.time == 0.5 and estimate.seconds > 0
         row = estimate.to_pandas()
         assert row["sigma_x1"].iloc[0] == pytest.approx(np.sqrt(estimate.covariance[0, 0]))
-        assert repr(estimate).startswith("WindowEstimate(")
+        assert repr(estimate).startswith("WindowEstimate at 0.5 s: solved")
 
     def test_windows_grow_and_then_slide(self):
         model = ring()
