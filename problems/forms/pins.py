@@ -49,6 +49,8 @@ class Pins:
 
     def violation(self, point: np.ndarray, numbers: np.ndarray) -> float:
         """Largest residual of the equalities handled here; NaN where one is not finite."""
+        if not self._terms:
+            return 0.0
         return float(np.max([np.abs(_rows(e, point, numbers)[0]).max() for e in self._terms], initial=0.0))
 
     def multipliers(self, point: np.ndarray, numbers: np.ndarray, dual: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ ch. 18).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,6 +41,7 @@ from problems.solvers.settings import own_version
 DAMPING_START = 1e-6
 DAMPING_LIMIT = 1e12
 NEAR = 1e-2  # share of the cost below which a decrease says that the matrix hardly changes any more
+SHORT = 1e-6  # squared length of a step that is taken without a look at the cost where its decrease shows convergence
 CONTRACTION = 0.1  # share of the last decrease below which a step with the kept matrix is taken
 RUNG_ITERATIONS = 10  # of each wider loss in graduated non-convexity
 
@@ -223,7 +225,7 @@ class _Search:
                 return Status.TIME_LIMIT, f"stopped after {self.options.time_limit:g} s"
             cost, gradient, hessian = self.ahead or self.bound.linearize(self.point)
             self.ahead = None
-            if not np.isfinite(cost):
+            if not math.isfinite(cost):
                 return Status.FAILED, "the cost is not finite at the iterate"
             self.iterations += 1
             outcome = self._advance(cost, gradient, hessian, tolerance, fixed is not None)
@@ -254,10 +256,14 @@ class _Search:
     ) -> tuple[Status, str] | None:
         """One accepted step, or the reason to stop."""
         session = self.session
-        session.pins.reduce(gradient, hessian, session.form_.pattern)
+        free = session.settings.screen and not session.constraints.size
+        if session.pins.columns.size:
+            session.pins.reduce(gradient, hessian, session.form_.pattern)
         self.hessian = hessian
         violation, largest = self._violation(self.point)
-        kept = None if forced else self._kept_step(cost, gradient, hessian, tolerance)
+        kept = None
+        if self.gained is not None and session.sparse and not forced:
+            kept = self._kept_step(cost, gradient, hessian, tolerance)
         while True:
             damped = hessian
             if self.damping > 0:
@@ -276,18 +282,17 @@ class _Search:
                     step = np.full(gradient.size, np.nan)
             except SingularError as error:
                 if self.damping == 0 and not session.constraints.size:
-                    free = self.layout.names_of((hessian[self.diagonal] <= 0).astype(float))
-                    if free:
-                        return Status.UNBOUNDED, f"the costs leave {free} free ({error})"
+                    unseen = self.layout.names_of((hessian[self.diagonal] <= 0).astype(float))
+                    if unseen:
+                        return Status.UNBOUNDED, f"the costs leave {unseen} free ({error})"
                 if not self._harder():
                     return Status.FAILED, f"no step found: {error}"
                 continue
-            failed = None
-            if session.constraints.size or not session.settings.screen:
+            if not free:
                 failed, step = self._constrained(step, gradient, damped)
                 if failed is not None:
                     return failed
-            if kept is None and not session.constraints.size and session.settings.screen:
+            if kept is None and free:
                 # as the step solves the damped system
                 decrease = (float(pull @ step**2 if self.damping > 0 else 0.0) - float(gradient @ step)) / 2
             else:
@@ -297,6 +302,9 @@ class _Search:
             if forced:
                 self.point = trial
                 return None
+            if small and free and self.damping == 0 and step.dot(step) <= SHORT:
+                self.point = trial
+                return Status.SOLVED, ""
             # an undamped step is nearly always taken, and its linearization gives the cost as well
             ahead = None if small or self.damping > 0 else self.bound.linearize(trial)
             new = self.bound.cost(trial) if ahead is None else ahead[0]
@@ -323,7 +331,7 @@ class _Search:
 
     def _kept_step(self, cost: float, gradient: np.ndarray, hessian: np.ndarray, tolerance: float) -> np.ndarray | None:
         """The step of the last factorization, if it shows convergence or saves an expensive one; else None."""
-        if self.gained is None or not (self.session.sparse and self.session.settings.screen):
+        if not self.session.settings.screen:
             return None
         step = -self.session._linear.solve(gradient)
         decrease = self._decrease(gradient, hessian, step)
