@@ -6,12 +6,13 @@ Source: dmhe-pre-estimation 3.3, 3.6, 4.2 and errata E1-E3; design section 3.3.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
 
 from mhe.covariance import CovarianceUpdate
+from mhe.options import MethodOptions
 from mhe.window import WindowForm
-from problems.errors import SettingError, UnknownNameError
+from problems.errors import SettingError
 from problems.networks import FusionRule
 
 Disturbance = Literal["process_noise", "observer"]
@@ -23,7 +24,7 @@ Infeasible = Literal["predict", "soft"]
 
 
 @dataclass(frozen=True)
-class DistributedOptions:
+class DistributedOptions(MethodOptions):
     """Options of a distributed moving horizon estimator, each of them independent of the others.
 
     Attributes:
@@ -54,6 +55,8 @@ class DistributedOptions:
         SettingError: a number outside its range.
     """
 
+    kind: ClassVar[str] = "a distributed method"
+
     disturbance: Disturbance = "process_noise"
     weights: WeightRule = "uniform"
     share: float = 1.0
@@ -72,32 +75,10 @@ class DistributedOptions:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            value = getattr(self, name)
-            if value not in get_args(choices):
-                raise UnknownNameError(name, str(value), get_args(choices))
+        super().__post_init__()
         if not 0 <= self.share <= 1:
             raise SettingError(f"share: expected a number in [0, 1], got {self.share!r}")
-        if isinstance(self.horizon, bool) or int(self.horizon) != self.horizon or self.horizon < 1:
-            raise SettingError(f"horizon: expected a whole number of transitions of at least 1, got {self.horizon!r}")
-        if self.forget_after is not None and self.forget_after < 0:
-            raise SettingError(f"forget_after: expected a number of steps or None, got {self.forget_after!r}")
 
-    def as_dict(self) -> dict[str, Any]:
-        """All options by name, as the scenarios print them."""
-        return asdict(self)
-
-
-_CHOICES: dict[str, Any] = {
-    "disturbance": Disturbance,
-    "weights": WeightRule,
-    "reference": Reference,
-    "weight_fusion": FusionRule,
-    "pi_update": CovarianceUpdate,
-    "growth_prior": NetworkGrowthPrior,
-    "covariances": CovarianceExchange,
-    "infeasible": Infeasible,
-}
 
 METHODS: dict[str, DistributedOptions] = {
     "dmhe_f": DistributedOptions(disturbance="process_noise", weights="uniform"),
@@ -120,14 +101,4 @@ def options_of(method: str | DistributedOptions, **overrides: Any) -> Distribute
         UnknownNameError: no such method or option.
         SettingError: a value outside its range.
     """
-    if isinstance(method, DistributedOptions):
-        base = method
-    elif method in METHODS:
-        base = METHODS[method]
-    else:
-        raise UnknownNameError("distributed method", method, METHODS)
-    names = [entry.name for entry in fields(DistributedOptions)]
-    for name in overrides:
-        if name not in names:
-            raise UnknownNameError("option of a distributed method", name, names)
-    return replace(base, **overrides)
+    return DistributedOptions.of(METHODS, method, overrides)

@@ -6,11 +6,12 @@ Source: dmhe-l-step, Models and equations, Algorithms, errata 1, 4-8; design sec
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
 
+from mhe.options import MethodOptions
 from mhe.window import WindowForm
-from problems.errors import SettingError, UnknownNameError
+from problems.errors import SettingError
 
 RelayDisturbance = Literal["observer", "process_noise"]
 FusionWeights = Literal["given", "uniform", "metropolis"]
@@ -23,7 +24,7 @@ WeightExchange = Literal["offline", "online"]
 
 
 @dataclass(frozen=True)
-class RelayOptions:
+class RelayOptions(MethodOptions):
     """Options of an l-step neighbourhood estimator, each of them independent of the others.
 
     Attributes:
@@ -59,6 +60,8 @@ class RelayOptions:
         SettingError: a number outside its range.
     """
 
+    kind: ClassVar[str] = "an l-step method"
+
     disturbance: RelayDisturbance = "observer"
     l: int | None = None
     latency: int = 0
@@ -81,12 +84,7 @@ class RelayOptions:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            value = getattr(self, name)
-            if value not in get_args(choices):
-                raise UnknownNameError(name, str(value), get_args(choices))
-        if isinstance(self.horizon, bool) or int(self.horizon) != self.horizon or self.horizon < 1:
-            raise SettingError(f"horizon: expected a whole number of transitions of at least 1, got {self.horizon!r}")
+        super().__post_init__()
         if self.l is not None and (isinstance(self.l, bool) or self.l not in range(1, self.horizon + 1)):
             raise SettingError(
                 f"l: expected a path length between 1 and the horizon N={self.horizon} (measurements older than the "
@@ -102,29 +100,12 @@ class RelayOptions:
             )
         if not 0 < self.penalty < float("inf"):
             raise SettingError(f"penalty: expected a positive number, got {self.penalty!r}")
-        if self.forget_after is not None and self.forget_after < 0:
-            raise SettingError(f"forget_after: expected a number of steps or None, got {self.forget_after!r}")
 
     @property
     def steps(self) -> int:
         """l, with the horizon for None."""
         return self.horizon if self.l is None else self.l
 
-    def as_dict(self) -> dict[str, Any]:
-        """All options by name, as the scenarios print them."""
-        return asdict(self)
-
-
-_CHOICES: dict[str, Any] = {
-    "disturbance": RelayDisturbance,
-    "weights": FusionWeights,
-    "startup": Startup,
-    "omega": Omega,
-    "gains": GainRule,
-    "relay": Relaying,
-    "exchange": WeightExchange,
-    "bounds": Hardness,
-}
 
 RELAY_METHODS: dict[str, RelayOptions] = {
     "dmhe_l_pre": RelayOptions(),
@@ -144,14 +125,4 @@ def relay_options_of(method: str | RelayOptions, **overrides: Any) -> RelayOptio
         UnknownNameError: no such method or option.
         SettingError: a value outside its range.
     """
-    if isinstance(method, RelayOptions):
-        base = method
-    elif method in RELAY_METHODS:
-        base = RELAY_METHODS[method]
-    else:
-        raise UnknownNameError("l-step method", method, RELAY_METHODS)
-    names = [entry.name for entry in fields(RelayOptions)]
-    for name in overrides:
-        if name not in names:
-            raise UnknownNameError("option of an l-step method", name, names)
-    return replace(base, **overrides)
+    return RelayOptions.of(RELAY_METHODS, method, overrides)

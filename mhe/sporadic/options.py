@@ -6,12 +6,13 @@ Source: dmhe-sporadic-fov 1, 3 and section 10; design section 3.3.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal
 
 from mhe.covariance import DetectionUpdate
 from mhe.distributed.options import Disturbance, NetworkGrowthPrior
-from problems.errors import SettingError, UnknownNameError
+from mhe.options import MethodOptions
+from problems.errors import SettingError
 from problems.networks import FusionRule
 
 ObserverData = Literal["local", "regional"]
@@ -24,7 +25,7 @@ InfeasibleRows = Literal["soft", "predict"]
 
 
 @dataclass(frozen=True)
-class SporadicOptions:
+class SporadicOptions(MethodOptions):
     """Options of a distributed estimator with detections, each of them independent of the others.
 
     Attributes:
@@ -62,6 +63,8 @@ class SporadicOptions:
         SettingError: a number outside its range, or ``prior="filter"`` with options it excludes.
     """
 
+    kind: ClassVar[str] = "a method with detections"
+
     disturbance: Disturbance = "observer"
     observer: ObserverData = "local"
     weights: DetectionWeights = "rank"
@@ -83,19 +86,12 @@ class SporadicOptions:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            value = getattr(self, name)
-            if value not in get_args(choices):
-                raise UnknownNameError(name, str(value), get_args(choices))
+        super().__post_init__()
         if not 0 < self.rank_floor < 1:
             raise SettingError(f"rank_floor: expected a number between 0 and 1, got {self.rank_floor!r}")
-        if isinstance(self.horizon, bool) or int(self.horizon) != self.horizon or self.horizon < 1:
-            raise SettingError(f"horizon: expected a whole number of transitions of at least 1, got {self.horizon!r}")
         for name in ("penalty", "covariance_cap"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise SettingError(f"{name}: expected a positive number, got {getattr(self, name)!r}")
-        if self.forget_after is not None and self.forget_after < 0:
-            raise SettingError(f"forget_after: expected a number of steps or None, got {self.forget_after!r}")
         if self.prior == "filter" and (self.pi_update, self.growth_prior) != ("onestep", "mean"):
             raise SettingError(
                 "prior='filter' carries the filter's own mean and covariance, so it needs pi_update='onestep' and "
@@ -107,24 +103,6 @@ class SporadicOptions:
         if self.pieces != "none" and self.rows == "none":
             raise SettingError(f"pieces={self.pieces!r} refine the rows of the sensors' sets; set rows='hard' too")
 
-    def as_dict(self) -> dict[str, Any]:
-        """All options by name, as the scenarios print them."""
-        return asdict(self)
-
-
-_CHOICES: dict[str, Any] = {
-    "disturbance": Disturbance,
-    "observer": ObserverData,
-    "weights": DetectionWeights,
-    "weight_fusion": FusionRule,
-    "pi_update": DetectionUpdate,
-    "prior": DetectionPrior,
-    "growth_prior": NetworkGrowthPrior,
-    "rows": RowRule,
-    "row_scope": RowScope,
-    "pieces": PieceRule,
-    "unmet": InfeasibleRows,
-}
 
 _PRE = SporadicOptions()
 _NOISE = SporadicOptions(disturbance="process_noise", weights="uniform", weight_fusion="out_degree")
@@ -147,14 +125,4 @@ def options_of(method: str | SporadicOptions, **overrides: Any) -> SporadicOptio
         UnknownNameError: no such method or option.
         SettingError: values that do not fit.
     """
-    if isinstance(method, SporadicOptions):
-        base = method
-    elif method in METHODS:
-        base = METHODS[method]
-    else:
-        raise UnknownNameError("method with detections", method, METHODS)
-    names = [entry.name for entry in fields(SporadicOptions)]
-    for name in overrides:
-        if name not in names:
-            raise UnknownNameError("option of a method with detections", name, names)
-    return replace(base, **overrides)
+    return SporadicOptions.of(METHODS, method, overrides)
