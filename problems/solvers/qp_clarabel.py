@@ -22,6 +22,8 @@ _STATUS = {
     "MaxTime": Status.TIME_LIMIT,
 }
 
+_ROUNDING = 1e-9
+
 
 @dataclass(frozen=True)
 class ClarabelSettings:
@@ -84,7 +86,9 @@ class Clarabel(Backend):
         tolerance = interior_tolerance(common.tolerance)
         values = native(
             self._settings,
-            tol_feas=tolerance,
+            # A full step leaves rounding alone of the residuals of the rows; the library takes rounding above its
+            # tolerance for divergence and stops far from the optimum.
+            tol_feas=max(tolerance, _ROUNDING),
             tol_gap_abs=tolerance,
             tol_gap_rel=tolerance,
             max_iter=common.iteration_limit,
