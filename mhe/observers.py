@@ -196,6 +196,25 @@ def minimal_radius_gain(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike) 
     return ObserverGain(state, output, _riccati_gain(state, output, Q, R, scale=radius), "minimal_radius")
 
 
+def stationary_gain(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike) -> ObserverGain:
+    """The gain a node has where none is given: `kalman_gain`, where no gain makes errors decay `minimal_radius_gain`.
+
+    Args:
+        A: (n, n).
+        C: (p, n).
+        Q: (n, n) covariance of the disturbance on the state, positive semidefinite.
+        R: (p, p) covariance of the measurement noise, positive definite.
+
+    Raises:
+        ShapeError, NoiseError: see `kalman_gain`.
+    """
+    none = given_gain(A, C, np.zeros(np.shape(C)[::-1]))
+    if not none.observable_rank:
+        return none
+    rule = kalman_gain if none.reachable_radius < 1 else minimal_radius_gain
+    return rule(A, C, Q, R)
+
+
 def _riccati_gain(state: np.ndarray, output: np.ndarray, Q: ArrayLike, R: ArrayLike, scale: float | None) -> np.ndarray:
     from scipy.linalg import solve_discrete_are
 

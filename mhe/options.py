@@ -57,6 +57,7 @@ class MethodOptions:
             SettingError: a value outside its range.
         """
         assert is_dataclass(cls)
+        base: Any
         if isinstance(method, cls):
             base = method
         elif isinstance(method, str) and method in methods:

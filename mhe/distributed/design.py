@@ -17,7 +17,8 @@ from mhe.distributed import checks
 from mhe.distributed.options import DistributedOptions, options_of
 from mhe.distributed.plan import ArrivalSchedule, NodePlan
 from mhe.distributed.pool import WindowPool
-from mhe.observers import ObserverGain, given_gain, kalman_gain, minimal_radius_gain
+from mhe.observers import ObserverGain, given_gain, stationary_gain
+from mhe.placement import Placement
 from mhe.polyhedron import Polyhedron
 from problems.errors import DefinitionError, ModelWarning, SettingError, ShapeError
 from problems.models import LinearModel, Model
@@ -101,7 +102,11 @@ class NetworkDesign:
         self.pool = WindowPool() if pool is None else pool
         if disturbance_bounds is not None:
             disturbance_bounds.warn_without_origin("disturbance bounds")
-        self._place(placement)
+        self.placement = Placement(model, network, placement)
+        self.own_rows = self.placement.rows
+        regions = [network.in_neighborhood(node) for node in range(network.count)]
+        self.regional_rows = tuple(np.concatenate([self.own_rows[j] for j in region]) for region in regions)
+        self.regional = tuple(self.placement.seen_by(region) for region in regions)
         self.outputs = [model.C[rows] for rows in self.own_rows]
         self.noises = [model.R[np.ix_(rows, rows)] for rows in self.own_rows]
         self.observability: ObservabilityReport | None = checks.checked_observability(
@@ -120,30 +125,6 @@ class NetworkDesign:
         checks.check_reach(self.reach)
         checks.check_growth(self.growth, self.cap)
         self._covariances: tuple[int, NetworkCovariances] | None = None
-
-    def _place(self, placement: Sequence[Hashable] | None) -> None:
-        """Who owns which sensors, and which rows of the collective measurement."""
-        model, network = self.model, self.network
-        owners = network.labels if placement is None else tuple(placement)
-        if len(owners) != len(model.sensors):
-            raise ShapeError(
-                f"the model has {len(model.sensors)} sensors for {len(owners)} "
-                f"{'nodes' if placement is None else 'labels in placement'}; pass placement= with the label of the "
-                "node that each sensor belongs to"
-            )
-        owned: list[list[int]] = [[] for _ in range(network.count)]
-        for number, label in enumerate(owners):
-            owned[network.index(label)].append(number)
-        position = np.arange(model.measurement_size)
-        rows = [position[model.rows(sensor.name)] for sensor in model.sensors]
-
-        def stacked(numbers: list[int]) -> np.ndarray:
-            return np.concatenate([position[:0], *(rows[k] for k in numbers)])
-
-        regions = [[k for j in network.in_neighborhood(i) for k in owned[j]] for i in range(network.count)]
-        self.own_rows = tuple(stacked(numbers) for numbers in owned)
-        self.regional_rows = tuple(stacked(numbers) for numbers in regions)
-        self.regional = tuple(model.with_sensors([model.sensors[k] for k in numbers]) for numbers in regions)
 
     def _weights(self, matrix: Any) -> Weights:
         options, network = self.options, self.network
@@ -175,7 +156,7 @@ class NetworkDesign:
                 )
             return None
         if gains is None:
-            return tuple(self._default_gain(node) for node in range(self.network.count))
+            return tuple(stationary_gain(one.A, one.C, one.process_covariance, one.R) for one in self.regional)
         if len(gains) != self.network.count:
             raise ShapeError(f"expected one gain per node ({self.network.count}), got {len(gains)}")
         found = []
@@ -191,14 +172,6 @@ class NetworkDesign:
                     f"{found[-1].gain.shape}"
                 )
         return tuple(found)
-
-    def _default_gain(self, node: int) -> ObserverGain:
-        region = self.regional[node]
-        none = given_gain(region.A, region.C, np.zeros(region.C.shape[::-1]))
-        if not none.observable_rank:
-            return none
-        rule = kalman_gain if none.reachable_radius < 1 else minimal_radius_gain
-        return rule(region.A, region.C, region.process_covariance, region.R)
 
     def covariances(self, updates: int = LONGEST_SCHEDULE) -> NetworkCovariances:
         """Arrival covariances of all nodes, off-line (4.1 item 3).
@@ -269,26 +242,5 @@ class NetworkDesign:
         )
 
     def by_node(self, measurements: Any) -> list[Any]:
-        """One entry per node from what `step` was given.
-
-        Args:
-            measurements: one entry (p_i,) or None per node, a matrix (count, p), or the collective vector (p,) of all
-                sensors in the order of the model; None where nothing was measured.
-
-        Raises:
-            ShapeError: anything else.
-        """
-        if measurements is None:
-            return [None] * self.network.count
-        if isinstance(measurements, np.ndarray) and measurements.ndim == 1:
-            if measurements.shape != (self.model.measurement_size,):
-                raise ShapeError(
-                    f"measurements: a vector holds all {self.model.measurement_size} component(s) of the model's "
-                    f"sensors, got shape {measurements.shape}; or give one entry per node"
-                )
-            return [measurements[rows] for rows in self.own_rows]
-        if len(measurements) != self.network.count:
-            raise ShapeError(
-                f"measurements: expected one entry per node ({self.network.count}), got {len(measurements)}"
-            )
-        return list(measurements)
+        """One entry per node from what `step` was given, see `Placement.by_node`."""
+        return self.placement.by_node(measurements)

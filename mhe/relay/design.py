@@ -15,11 +15,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from mhe.covariance import definite, window_information
-from mhe.observers import ObserverGain
+from mhe.observers import ObserverGain, stationary_gain
+from mhe.placement import Placement
 from mhe.polyhedron import Polyhedron
-from mhe.relay.local import GainTable, LocalProblem, Output, stationary_gain
+from mhe.relay.local import GainTable, LocalProblem, Output
 from mhe.relay.options import RelayOptions, relay_options_of
-from mhe.relay.placement import Placement
 from mhe.relay.prior import prior_information
 from mhe.relay.report import RelayReport, relay_report
 from mhe.relay.schedule import RelaySchedule, relay_schedule
@@ -269,7 +269,7 @@ class RelayDesign:
                     estimated = self.options.disturbance == "process_noise"
                     gain = np.zeros(C.shape[::-1])
                     if not estimated:
-                        gain = stationary_gain(model.A, C, model.process_covariance, R)
+                        gain = stationary_gain(model.A, C, model.process_covariance, R).gain
                 outputs.append(Output(model.A, C, R, gain))
             kinds[node] = known[key]
         return kinds, outputs

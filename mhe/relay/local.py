@@ -13,20 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from mhe.covariance import output_information, symmetrized, window_information
-from mhe.observers import given_gain, kalman_gain, minimal_radius_gain
+from mhe.observers import stationary_gain
 from mhe.relay.options import RelayOptions
 from mhe.relay.rule import reach
 from problems.models import LinearModel
 from problems.networks import observability_rank
-
-
-def stationary_gain(A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Gain (n, p) of a stationary Kalman predictor, of the smallest reachable radius where that is 1 or more."""
-    none = given_gain(A, C, np.zeros(C.shape[::-1]))
-    if not none.observable_rank:
-        return none.gain
-    rule = kalman_gain if none.reachable_radius < 1 else minimal_radius_gain
-    return rule(A, C, Q, R).gain
 
 
 class Output:
@@ -73,7 +64,7 @@ class GainTable:
             np.vstack([part.C for part in parts]),
             self.model.process_covariance,
             block_diagonal([part.R for part in parts]),
-        )
+        ).gain
         ends = np.cumsum([len(part.C) for part in parts])[:-1]
         return np.split(gain, ends, axis=1)
 

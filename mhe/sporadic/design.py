@@ -6,12 +6,13 @@ Source: dmhe-sporadic-fov 4 (off-line) and section 5.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from mhe.placement import Placement
 from mhe.polyhedron import Polyhedron
 from mhe.sporadic.blocks import Blocks, blocks_of
 from mhe.sporadic.gains import (
@@ -102,7 +103,8 @@ class SporadicDesign:
         self.model, self.network = model, network
         self.options = options_of(method, **overrides)
         self.pool = DetectionPool() if pool is None else pool
-        self.own_sensors = self._placed(placement)
+        self.placement = self._placed(placement)
+        self.own_sensors = tuple(np.array(numbers, dtype=np.intp) for numbers in self.placement.owned)
         self._regions = [
             np.concatenate([self.own_sensors[j] for j in network.in_neighborhood(i)]) for i in range(network.count)
         ]
@@ -114,7 +116,7 @@ class SporadicDesign:
         self.weights = self._weights(weight_matrix)
         self._check_growth()
 
-    def _placed(self, placement: Sequence[Hashable] | None) -> tuple[np.ndarray, ...]:
+    def _placed(self, placement: Sequence[Hashable] | None) -> Placement:
         count, sensors = self.network.count, len(self.model.sensors)
         if placement is None:
             if sensors % count:
@@ -122,13 +124,8 @@ class SporadicDesign:
                     f"{sensors} sensors cannot be shared out evenly among {count} nodes; pass placement= with the "
                     "label of the node that each sensor belongs to"
                 )
-            return tuple(np.arange(sensors).reshape(count, -1))
-        if len(placement) != sensors:
-            raise ShapeError(
-                f"placement: expected the label of a node for each of {sensors} sensors, got {len(placement)}"
-            )
-        nodes = np.array([self.network.index(label) for label in placement], dtype=np.intp)
-        return tuple(np.flatnonzero(nodes == node) for node in range(count))
+            placement = [label for label in self.network.labels for _ in range(sensors // count)]
+        return Placement(self.model, self.network, placement)
 
     def _fields(self, fields: Any) -> tuple[Polyhedron | None, ...]:
         if fields is None:
@@ -369,26 +366,18 @@ class SporadicDesign:
         """
         if values is not None and len(values) == self.network.count and isinstance(values[0], Reading):
             return list(values)
-        parts = zip(
-            self._split(values, self._rows, "values"), self._split(flags, self.own_sensors, "flags"), strict=True
-        )
-        found = [Reading(value, flag) for value, flag in parts]
+        found = [Reading(value, flag) for value, flag in self._parted(values, flags)]
         for time, then, mask in late:
-            pieces = zip(
-                self._split(then, self._rows, "values"), self._split(mask, self.own_sensors, "flags"), strict=True
-            )
             found = [
                 node if value is None else node._replace(late=(*node.late, (time, value, flag)))
-                for node, (value, flag) in zip(found, pieces, strict=True)
+                for node, (value, flag) in zip(found, self._parted(then, mask), strict=True)
             ]
         return found
 
-    @cached_property
-    def _rows(self) -> tuple[np.ndarray, ...]:
-        """Components of the collective measurement that belong to each node."""
-        position = np.arange(self.model.measurement_size)
-        of_sensor = [position[self.model.rows(sensor.name)] for sensor in self.model.sensors]
-        return tuple(np.concatenate([position[:0], *(of_sensor[s] for s in own)]) for own in self.own_sensors)
+    def _parted(self, values: Any, flags: Any) -> Iterator[tuple[Any, Any]]:
+        """Values and flags of every node."""
+        split = self._split(values, self.placement.rows, "values"), self._split(flags, self.own_sensors, "flags")
+        return zip(*split, strict=True)
 
     def _split(self, given: Any, places: tuple[np.ndarray, ...], what: str) -> list[Any]:
         count, size = self.network.count, sum(part.size for part in places)
