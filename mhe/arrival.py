@@ -117,7 +117,7 @@ class ArrivalCost(ABC):
         if np.abs(matrix - self._passed).max() <= SETTLED_TOLERANCE * np.abs(matrix).max():
             return {}
         self._passed = matrix
-        return {"information": matrix}
+        return {"information": matrix.reshape(1, -1)}  # as the session stores it
 
 
 class FilterArrival(ArrivalCost):

@@ -50,6 +50,9 @@ def schur(H: np.ndarray, G: np.ndarray, F: np.ndarray, E: np.ndarray, drop: int)
         UnobservableError: the costs and equalities leave a dropped unknown free.
     """
     m = F.shape[0]
+    found = None if m else _definite(H, G, drop)
+    if found is not None:
+        return found
     K = np.zeros((drop + m, drop + m))
     K[:drop, :drop] = H[:drop, :drop]
     K[:drop, drop:], K[drop:, :drop] = F[:, :drop].T, F[:, :drop]
@@ -173,8 +176,10 @@ def _definite(H: np.ndarray, gradient: np.ndarray, drop: int) -> tuple[np.ndarra
     # the smallest pivot of a matrix with unit diagonal bounds its condition well enough to leave doubtful ones alone
     if info != 0 or not root.diagonal().min() > 1e-4:
         return None
-    right = np.empty((drop, H.shape[0] - drop + 1))
-    right[:, :-1], right[:, -1] = H[:drop, drop:], gradient[:drop]
+    kept = H.shape[0] - drop
+    right = np.empty((drop, kept + (1 if gradient.ndim == 1 else gradient.shape[1])))
+    right[:, :kept] = H[:drop, drop:]
+    right[:, kept:] = gradient[:drop, None] if gradient.ndim == 1 else gradient[:drop]
     carried = dtrtrs(root, scale[:, None] * right, lower=1)[0]
-    cross = carried[:, :-1]
-    return H[drop:, drop:] - cross.T @ cross, gradient[drop:] - cross.T @ carried[:, -1]
+    cross, moved = carried[:, :kept], carried[:, kept:]
+    return H[drop:, drop:] - cross.T @ cross, gradient[drop:] - cross.T @ (moved[:, 0] if gradient.ndim == 1 else moved)

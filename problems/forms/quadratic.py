@@ -86,6 +86,7 @@ class Reduced:
         self.A, self.E, self.c = R, E, c
         self.equalities = equality[0].shape[0]
         self._constants: dict[bytes, tuple[Matrix, Matrix, np.ndarray]] = {}
+        self._given: dict[bytes, Given] = {}
 
     @property
     def size(self) -> int:
@@ -157,6 +158,15 @@ class Reduced:
 
         return gradient
 
+    def given(self, flags: dict[str, np.ndarray | None], pattern: bytes) -> Given:
+        """What the data give whatever the weights, kept per pattern (dense only)."""
+        found = self._given.get(pattern)
+        if found is None:
+            if len(self._given) >= PATTERNS:
+                self._given.pop(next(iter(self._given)))
+            found = self._given[pattern] = Given(self, flags)
+        return found
+
     def bounds(self, numbers: np.ndarray, flags: dict[str, np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the rows ``A v`` for given data."""
         shift = self.E @ numbers + self.c
@@ -181,6 +191,35 @@ class Reduced:
                 for r, on in zip(self.bounded, states, strict=True)
             ]
         )
+
+
+class Given:
+    """Bounds of the rows and the offset in ``z = Z v + offset``, ``D d + d`` but for bounds that are data."""
+
+    def __init__(self, reduced: Reduced, flags: dict[str, np.ndarray | None]) -> None:
+        self._reduced, self._flags = reduced, flags
+        self.D: np.ndarray = np.ascontiguousarray(_stack([reduced.E, reduced.map.Y]))
+        self.d = np.concatenate([reduced.c, reduced.map.z0])
+        self._fixed = None
+        if not ((reduced.lower.index >= 0).any() or (reduced.upper.index >= 0).any()):
+            l, u = reduced.bounds(np.zeros(reduced.E.shape[1]), flags)
+            self._fixed = l + reduced.c, u + reduced.c
+
+    def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """l, u and the offset."""
+        out = self.D.dot(numbers)
+        out += self.d
+        return self.split(out, numbers)
+
+    def split(self, values: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same from ``D numbers + d``."""
+        size = self._reduced.c.size
+        if self._fixed is None:
+            l, u = self._reduced.bounds(numbers, self._flags)
+        else:
+            shift = values[:size]
+            l, u = self._fixed[0] - shift, self._fixed[1] - shift
+        return l, u, values[size:]
 
 
 def _cost(rows: Rows, map_: AffineMap) -> CostTerm:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs  # type: ignore[attr-defined]
 
 from problems.errors import DataError, MissingExtraError, SettingError
+from problems.forms.marginal import Marginal
 from problems.forms.quadratic import clean
 from problems.forms.quadratic_code import Assembled, QuadraticCode
 from problems.solvers.base import QPResult, Status
@@ -46,6 +47,10 @@ class CodeSession(QPSession):
 
     def _update(self) -> None:
         return
+
+    def _marginal(self, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
+        self._changed(numbers=True)  # new data are not compared with those before
+        return super()._marginal(drop, keep, point)
 
     def _solve(self) -> Solution:
         numbers, flags = self.store.numbers, None

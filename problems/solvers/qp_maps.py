@@ -9,6 +9,7 @@ as iterations of Gauss-Newton would.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,7 @@ class DenseMap:
         rows: the uncondensed rows with these weights, once a solution was checked.
         definite: there is an affine answer. Where only linear costs and inequalities hold an unknown (exact penalties),
             neither is it free nor is there one.
+        exact: answers are T d + t, without refinement.
     """
 
     def __init__(
@@ -45,38 +47,46 @@ class DenseMap:
     ) -> None:
         self.reduced, self.flags = reduced, flags
         self.rows: StackedRows | None = None
-        self._vectors: _Vectors | None = None
-        self._refine: _Refinement | None = None
         self.size = program.layout.size
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
+        self._given = reduced.given(flags, pattern)
         inner = reduced.inner
         if inner is None:
             H, G, g = self.P, self.Q, self.q0
         else:
             NP = inner.Z.T @ self.P
             H, G, g = NP @ inner.Z, inner.Z.T @ self.Q + NP @ inner.Y, inner.Z.T @ self.q0 + NP @ inner.z0
-        self.free = None
-        flat, share = _flat_directions(H)
-        self.definite = flat is None
+        self._linear = G, g
+        self._factor, flat, share = _factored(H)
+        self.free, self.definite = None, flat is None
+        self.exact = flat is not None or share >= WEAK
+        self._gradient = None if self.exact else reduced.gradient(store, flags)
         if flat is not None:
             unseen = flat[:, :1] if not reduced.bounded else _unseen(flat, np.column_stack([G, g]))
             if unseen.size:
                 direction = unseen[:, 0]
                 self.free = reduced.map.Z @ (direction if inner is None else inner.Z @ direction)
-            return
-        right = np.column_stack([G, g])
-        factor = dpotrf(H, lower=1)[0] if H.size else None
+
+    @cached_property
+    def table(self) -> tuple[np.ndarray, np.ndarray]:
+        """T and t."""
+        return self._tables[0], self._tables[1]
+
+    @cached_property
+    def _tables(self) -> tuple[np.ndarray, np.ndarray, _Refinement | None]:
+        reduced, flags, factor = self.reduced, self.flags, self._factor
+        inner, outer = reduced.inner, reduced.map
+        right = np.column_stack(self._linear)
         K = right if factor is None else dpotrs(factor, right, lower=1)[0]
         V, v = -K[:, :-1], -K[:, -1]
         if inner is not None:
             V, v = inner.Z @ V + inner.Y, inner.Z @ v + inner.z0
-        outer = reduced.map
         blocks, constants = [outer.Z @ V + outer.Y], [outer.Z @ v + outer.z0]
         m = reduced.equalities
+        signs = []
         if reduced.bounded:
             G, g = reduced.A[m:] @ V + reduced.E[m:], reduced.A[m:] @ v + reduced.c[m:]
             off = reduced.off_rows(flags)
-            signs = []
             for bound, sign in ((reduced.upper, 1.0), (reduced.lower, -1.0)):
                 used = bound.used if off is None else bound.used & ~off
                 signs.append((sign, used))
@@ -86,42 +96,61 @@ class DenseMap:
                 rows[by_data, index[by_data]] -= sign
                 blocks.append(rows)
                 constants.append(constant)
-        self.T = np.ascontiguousarray(np.vstack(blocks))
-        self.t = np.concatenate(constants)
-        if share < WEAK and factor is not None:
-            N = np.eye(H.shape[0]) if inner is None else inner.Z
+        refine = None
+        if self._gradient is not None and factor is not None:
+            N = np.eye(len(factor)) if inner is None else inner.Z
             lift = [outer.Z @ N]
             if reduced.bounded:
                 held = reduced.A[m:] @ N
                 lift += [sign * held[used] for sign, used in signs]
-            self._refine = _Refinement(reduced.gradient(store, flags), V, v, N, factor, np.vstack(lift))
+            refine = _Refinement(self._gradient, V, v, N, factor, np.vstack(lift))
+        return np.ascontiguousarray(np.vstack(blocks)), np.concatenate(constants), refine
 
     def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """All unknowns (n,) and the violations of all bounds (<= 0 where they hold)."""
-        out = self.T.dot(numbers)  # half the overhead of the operator
-        out += self.t
-        if self._refine is not None:
-            out += self._refine(numbers)
+        T, t, refine = self._tables
+        out = T.dot(numbers)  # half the overhead of the operator
+        out += t
+        if refine is not None:
+            out += refine(numbers)
         return out[: self.size], out[self.size :]
 
-    @property
-    def exact(self) -> bool:
-        """Answers are T d + t, without refinement."""
-        return self._refine is None
+    def once(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same without T, which costs as much as a dozen answers: for weights that may not come again."""
+        reduced, factor = self.reduced, self._factor
+        if factor is None or not self.exact or reduced.equalities:
+            return self(numbers)
+        q = self.Q.dot(numbers)
+        q += self.q0
+        v = -dpotrs(factor, q, lower=1)[0]
+        l, u, z = self._given(numbers)
+        z += reduced.map.Z.dot(v)
+        if not l.size:
+            return z, l
+        rows = reduced.A.dot(v)
+        return z, np.maximum(rows - u, l - rows)
 
     def many(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same for many rows of numbers (count, data): (count, n) and (count, bounds)."""
-        out = numbers @ self.T.T
-        out += self.t
-        if self._refine is not None:
-            out += self._refine(numbers.T).T
+        T, t, refine = self._tables
+        out = numbers @ T.T
+        out += t
+        if refine is not None:
+            out += refine(numbers.T).T
         return out[:, : self.size], out[:, self.size :]
+
+    @cached_property
+    def _stacked(self) -> tuple[np.ndarray, np.ndarray]:
+        given = self._given
+        return np.ascontiguousarray(np.vstack([self.Q, given.D])), np.concatenate([self.q0, given.d])
 
     def vectors(self, numbers: np.ndarray) -> Vectors:
         """q, l, u of the program, and the offset in ``z = Z v + offset``."""
-        if self._vectors is None:
-            self._vectors = _Vectors(self)
-        return self._vectors(numbers)
+        D, d = self._stacked
+        out = D.dot(numbers)
+        out += d
+        size = self.q0.size
+        return out[:size], *self._given.split(out[size:], numbers)
 
 
 class _Refinement:
@@ -147,49 +176,25 @@ class _Refinement:
         return self._lift @ total
 
 
-class _Vectors:
-    """All vectors of a dense program by one product."""
+def _factored(H: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None, float]:
+    """Lower factor of H, None where it has no size or is not positive definite (scale-free test).
 
-    def __init__(self, map_: DenseMap) -> None:
-        reduced = self._reduced = map_.reduced
-        self._flags = map_.flags
-        self._B = np.ascontiguousarray(np.vstack([map_.Q, reduced.E, reduced.map.Y]))
-        self._b = np.concatenate([map_.q0, reduced.c, reduced.map.z0])
-        self._ends = (map_.q0.size, map_.q0.size + reduced.c.size)
-        self._fixed = None
-        if not ((reduced.lower.index >= 0).any() or (reduced.upper.index >= 0).any()):
-            zero = np.zeros(reduced.E.shape[1])
-            l, u = reduced.bounds(zero, map_.flags)
-            self._fixed = l + reduced.c, u + reduced.c
-
-    def __call__(self, numbers: np.ndarray) -> Vectors:
-        out = self._B.dot(numbers)
-        out += self._b
-        first, second = self._ends
-        if self._fixed is None:
-            l, u = self._reduced.bounds(numbers, self._flags)
-        else:
-            shift = out[first:second]
-            l, u = self._fixed[0] - shift, self._fixed[1] - shift
-        return out[:first], l, u, out[second:]
-
-
-def _flat_directions(H: np.ndarray) -> tuple[np.ndarray | None, float]:
-    """Directions (n, k) without curvature, or None where H is positive definite (scale-free test).
-
-    Also the smallest share of a diagonal entry that elimination leaves, 0 where there is none.
+    Then its directions (n, k) without curvature, None where there are none; and the smallest share of a diagonal entry
+    that elimination leaves, 0 where H is not definite.
     """
     if not H.size:
-        return None, 1.0
+        return None, None, 1.0
     factor, info = dpotrf(H, lower=1)
     share = float((np.diagonal(factor) ** 2 / np.diagonal(H)).min()) if info == 0 else 0.0
     if share > INDEPENDENT:
-        return None, share
+        return factor, None, share
     diagonal = np.diagonal(H)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     flat = values <= FREE
-    return (vectors[:, flat] / scale[:, None] if flat.any() else None), share
+    if not flat.any():
+        return factor, None, share
+    return None, vectors[:, flat] / scale[:, None], share
 
 
 def _unseen(flat: np.ndarray, linear: np.ndarray) -> np.ndarray:
@@ -236,6 +241,8 @@ class SparseMap:
         l, u = reduced.bounds(numbers, self.flags)
         rows = reduced.A[m:] @ v
         return z, np.concatenate([rows - u[m:], l[m:] - rows])
+
+    once = __call__
 
     def many(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same for many rows of numbers."""

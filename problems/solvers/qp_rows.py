@@ -136,7 +136,8 @@ class StackedRows:
 
     def _certify(self, map_: DenseMap) -> tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]:
         n = map_.size
-        V = np.column_stack([map_.T[:n], map_.t[:n]])
+        T, t = map_.table
+        V = np.column_stack([T[:n], t[:n]])
         rows = self._rows[: self._missed.stop]
         M, given = rows[:, :n], rows[:, n + self._free.size :]
         values, sizes = M @ V + given, np.abs(M) @ np.abs(V) + np.abs(given)

@@ -23,6 +23,7 @@ from problems.solvers.qp_maps import DenseMap, SparseMap, require_observable
 from problems.solvers.qp_solution import QPCheck
 from problems.solvers.session import Session, Solution, slot_key
 
+SEEN = 4096  # sets of weights remembered as seen
 MAPS = 64  # patterns of missing data kept between changes of weights
 KEPT_NUMBERS = 4_000_000  # of affine maps kept for weights that come back, roughly
 
@@ -76,6 +77,8 @@ class QPSession(Session):
         self._works: dict[bytes, _Works] = {}
         self._now: _Works | None = None
         self._last_marginal: tuple[bytes, Any, Any, AffineMarginal] | None = None
+        self._seen: set[bytes] = set()
+        self._flags: dict[bytes, dict[str, Any]] = {}
         self._backend: QPBackend | None = None
         self._loaded: DenseMap | SparseMap | None = None
         self.last: tuple[np.ndarray, np.ndarray] | None = None
@@ -116,12 +119,17 @@ class QPSession(Session):
             key = b"".join(self.store[name].tobytes() for name in self._weights)
             self._now = self._works.pop(key, None) or _Works()
             self._works[key] = self._now
+            self._known = key in self._seen or not self.slow
+            if len(self._seen) >= SEEN:
+                self._seen.clear()
+            self._seen.add(key)
             if len(self._works) > self._kept:
                 self._works.pop(next(iter(self._works)))
         return self._now
 
     def _update(self) -> None:
         self._map(*self._pattern())
+        self._known = True  # work done ahead is to make the solve short
 
     def _pattern(self) -> tuple[bytes, np.ndarray]:
         """Key of the pattern of missing data and switches; the numbers with missing ones read as zero."""
@@ -144,7 +152,11 @@ class QPSession(Session):
 
     def _make(self, pattern: bytes, numbers: np.ndarray, store: Any) -> DenseMap | SparseMap:
         program = self.program
-        flags = program.flags(store.numbers)
+        flags = self._flags.get(pattern)
+        if flags is None:
+            if len(self._flags) >= MAPS:
+                self._flags.pop(next(iter(self._flags)))
+            flags = self._flags[pattern] = program.flags(store.numbers)
         reduced = program.reduced(numbers)
         if self.screens and program.dense and not program.eliminated:
             reduced = reduced.without_equalities
@@ -162,10 +174,12 @@ class QPSession(Session):
                 self.layout, point, Status.UNBOUNDED, self.solver, _check(self, numbers, map_, point), 0, message
             )
         if self.screens and map_.definite:
-            z, excess = map_(numbers)
+            once, self._known = not self._known, True
+            z, excess = map_.once(numbers) if once else map_(numbers)
             violation = float(np.maximum.reduce(excess)) if excess.size else 0.0
             if violation <= self.options.tolerance:
-                check = QPCheck(self.program, self.store, numbers.copy(), map_, z, None, violation)
+                by_map = None if once else violation
+                check = QPCheck(self.program, self.store, numbers.copy(), map_, z, None, by_map)
                 return Solution(self.layout, z, Status.SOLVED, "linear", check)
         return self._solve_qp(map_, numbers)
 
@@ -182,7 +196,7 @@ class QPSession(Session):
             if len(marginals) >= MAPS:
                 marginals.pop(next(iter(marginals)))
             plan = self._plan(drop, keep, AffineMarginalPlan)
-            found = marginals[key] = AffineMarginal(plan, self.store, numbers)
+            found = marginals[key] = AffineMarginal(plan, self.store, numbers, pattern)
         self._last_marginal = (pattern, drop, keep, found)
         return found(numbers, point)
 
@@ -261,8 +275,10 @@ class QPSession(Session):
     def reset(self) -> None:
         super().reset()
         self.last = self._backend = self._loaded = None
+        self._seen, self._now, self._last_marginal = set(), None, None
 
     def _forked(self) -> None:
+        self._seen = set(self._seen)
         self._backend = self._loaded = None
 
 

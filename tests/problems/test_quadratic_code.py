@@ -133,3 +133,15 @@ def test_what_code_cannot_assemble_is_refused():
     noisy.cost("c", lambda v: v, on=v, noise=Gaussian(covariance=noisy.data("R", (1, 1))))
     with pytest.raises(FormError, match="sigma or information"):
         noisy.compile("auto", assembly="code")
+
+
+def test_marginals_follow_the_weights_of_the_last_solve():
+    problem = Problem("pair")
+    x = problem.variables("x", Vector(1), 2)
+    problem.cost("prior", lambda x: x, on=x[0], noise=Gaussian(information=problem.data("W", (1, 1))))
+    problem.cost("moved", lambda x, ahead: ahead - x, on=(x[:-1], x[1:]))
+    session = problem.compile("auto", assembly="code")
+    for weight in (1.0, 4.0):
+        session.solve({"W": [[weight]]})
+        wanted = 1 / (1 / weight + 1)
+        assert session.marginal(x[0], x[1]).information == pytest.approx(wanted, rel=1e-12)

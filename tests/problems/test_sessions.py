@@ -713,3 +713,21 @@ def test_gauss_newton_damps_where_the_full_step_fails() -> None:
     p.cost("c", lambda x: ca.atan(x), on=x)  # the full step from 3 leads away
     got = p.compile("gauss-newton").solve(initial={"x": [[3.0]]})
     assert got.solved and abs(got["x"].item()) < 1e-3
+
+
+def test_reset_sessions_answer_to_the_bit_whatever_weights_they_knew() -> None:
+    """Weights met for the first time are answered without the map that those that come back get."""
+    sessions = [window().compile() for _ in range(2)]
+    weights = [0.5, 0.7, 0.5, 0.5, 0.9]
+
+    def run(session: Any) -> list[np.ndarray]:
+        session.reset()
+        return [session.solve({"y": outputs(k), "R": R})["x"].copy() for k, R in enumerate(weights)]
+
+    first = run(sessions[0])
+    for R in weights:
+        sessions[1].solve({"y": outputs(9), "R": R})
+    for repeated in (run(sessions[0]), run(sessions[1])):
+        assert all(np.array_equal(one, other) for one, other in zip(first, repeated, strict=True))
+    sessions[1].update(R=0.9)
+    np.testing.assert_allclose(sessions[1].solve({"y": outputs(4)})["x"], first[4], atol=1e-12)
