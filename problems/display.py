@@ -67,7 +67,9 @@ def new_figure(**options: Any) -> Figure:
         options: of the figure.
     """
     if "ipykernel" in sys.modules:
-        import matplotlib.pyplot  # noqa: F401  registers how a notebook shows figures
+        import matplotlib.pyplot as plt
+
+        plt.switch_backend(plt.get_backend())  # only this registers how a notebook shows figures
     from matplotlib.figure import Figure
 
     return Figure(**options)
