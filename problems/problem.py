@@ -8,6 +8,7 @@ measurements are one term and no Python object each. Nothing is computed here; `
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -88,7 +89,7 @@ class Data:
     @property
     def size(self) -> int:
         """Numbers per row."""
-        return int(np.prod(self.shape, dtype=int))
+        return math.prod(self.shape)
 
     def __getitem__(self, index: Index) -> DataSlot:
         if self.count is None:

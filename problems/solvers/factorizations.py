@@ -24,6 +24,8 @@ from problems.forms.sparsity import HessianPattern
 DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
 BAND_WIDTH = 32  # entries above the diagonal up to which banded Cholesky is faster, if it is much less than all
 BLOCK_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
+MESH_PAIRS = 1.75  # pairs of instances with a common term, per instance, from which a graph is much more than a tree
+MESH_SIZE = 20_000  # unknowns from which such graphs fill in heavily, and below which others never do
 HEAVY_WORK = 2e7  # the same for Pardiso, whose import takes a second once
 
 LinearSolver = Literal["auto", "dense", "banded", "qdldl", "superlu", "pardiso", "cholmod", "schur"]
@@ -257,11 +259,15 @@ def factorization(pattern: HessianPattern, solver: LinearSolver = "auto") -> Fac
         MissingExtraError: its package is not installed.
     """
     if solver == "auto":
+        # the work takes an order of elimination to know; of these it is known without
+        mesh = pattern.pairs > MESH_PAIRS * pattern.blocks
         if pattern.bandwidth <= min(BAND_WIDTH, pattern.size // 4):
             solver = "banded"
         elif pattern.size <= DENSE_SIZE:
             solver = "dense"
-        elif pattern.work >= HEAVY_WORK and find_spec("pypardiso") is not None:
+        elif not mesh and pattern.size < MESH_SIZE:
+            solver = "qdldl"
+        elif find_spec("pypardiso") and (mesh and pattern.size >= MESH_SIZE or pattern.work >= HEAVY_WORK):
             solver = "pardiso"
         else:
             solver = "superlu" if pattern.work >= BLOCK_WORK else "qdldl"

@@ -2,9 +2,9 @@
 
 Steps are computed from ``(H + lambda D) dx = -g`` with D the diagonal of H; lambda is zero until a step fails to reduce
 the cost (Levenberg-Marquardt, Marquardt 1963; Nocedal and Wright, ch. 10). Near the end the last factorization is tried
-again: it shows convergence, and where factorizations dominate its steps are good enough. Constraints are linearized in
-the tangent of the iterate and the step becomes a QP; steps are accepted on an l1 merit function (Nocedal and Wright,
-ch. 18).
+again: it shows convergence, and of large problems its steps are good enough, so that gradients alone are evaluated.
+Constraints are linearized in the tangent of the iterate and the step becomes a QP; steps are accepted on an l1 merit
+function (Nocedal and Wright, ch. 18).
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from problems.problem import Problem
 from problems.solvers.base import Options, Status
 from problems.solvers.factorizations import (
     DENSE_SIZE,
-    HEAVY_WORK,
     LinearSolver,
     SingularError,
     factorization,
@@ -91,7 +90,6 @@ class GaussNewton(Session):
         self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._linear = factorization(pattern, self.settings.linear_solver)
         self.sparse = pattern.size > DENSE_SIZE and self._linear.name != "banded"
-        self.heavy = self.sparse and pattern.work >= HEAVY_WORK
         rungs = ladder(problem) if self.settings.graduated else []
         self._known_gauge: tuple[bytes, str] | None = None
         self._rungs = [LeastSquares(rung, Layout(rung), self.settings.whole) for rung in rungs]
@@ -210,7 +208,8 @@ class _Search:
         self.penalty = 0.0
         self.doubtful = False  # the last step was no exact one, so its decrease is no test of convergence
         self.gained: float | None = None  # decrease of the last step, where its factorization may serve again
-        self.ahead: tuple[float, np.ndarray, np.ndarray] | None = None  # linearization where the last step led
+        # linearization where the last step led; without Hessian where the last factorization is expected to do
+        self.ahead: tuple[float, np.ndarray, np.ndarray | None] | None = None
         self.numbers = bound.numbers
         if session.constraints.size or not session.settings.screen:
             self.lower, self.upper = session.constraints.bounds(bound.numbers, bound.flags)
@@ -252,28 +251,31 @@ class _Search:
         return Status.SOLVED, "one feedback step as prepared, convergence not tested"
 
     def _advance(
-        self, cost: float, gradient: np.ndarray, hessian: np.ndarray, tolerance: float, forced: bool
+        self, cost: float, gradient: np.ndarray, hessian: np.ndarray | None, tolerance: float, forced: bool
     ) -> tuple[Status, str] | None:
         """One accepted step, or the reason to stop."""
         session = self.session
         free = session.settings.screen and not session.constraints.size
-        if session.pins.columns.size:
-            session.pins.reduce(gradient, hessian, session.form_.pattern)
-        self.hessian = hessian
+        gradient[session.pins.columns] = 0.0
         violation, largest = self._violation(self.point)
         kept = None
-        if self.gained is not None and session.sparse and not forced:
-            kept = self._kept_step(cost, gradient, hessian, tolerance)
+        if session.sparse and not forced:
+            kept = self._kept_step(cost, gradient, tolerance)
         while True:
+            if hessian is None and kept is None:
+                hessian = self.bound.linearize(self.point)[2]
+            if hessian is not None and hessian is not self.hessian:
+                session.pins.reduce(gradient, hessian, session.form_.pattern)
+                self.hessian = hessian
             damped = hessian
-            if self.damping > 0:
+            if self.damping > 0 and hessian is not None:
                 damped = hessian.copy()
                 pull = self.damping * np.maximum(hessian[self.diagonal], 1e-12)
                 damped[self.diagonal] += pull
             try:
                 if kept is not None:
                     step = kept
-                elif session.settings.screen:
+                elif session.settings.screen and damped is not None:
                     session._linear.factor(damped)
                     step = -session._linear.solve(gradient)
                     if not step.dot(step) < np.inf:
@@ -281,23 +283,23 @@ class _Search:
                 else:
                     step = np.full(gradient.size, np.nan)
             except SingularError as error:
-                if self.damping == 0 and not session.constraints.size:
+                if self.damping == 0 and not session.constraints.size and hessian is not None:
                     unseen = self.layout.names_of((hessian[self.diagonal] <= 0).astype(float))
                     if unseen:
                         return Status.UNBOUNDED, f"the costs leave {unseen} free ({error})"
                 if not self._harder():
                     return Status.FAILED, f"no step found: {error}"
                 continue
-            if not free:
+            if not free and hessian is not None and damped is not None:
                 failed, step = self._constrained(step, gradient, damped)
                 if failed is not None:
                     return failed
-            if kept is None and free:
-                # as the step solves the damped system
-                decrease = (float(pull @ step**2 if self.damping > 0 else 0.0) - float(gradient @ step)) / 2
-            else:
                 decrease = self._decrease(gradient, hessian, step)
-            small = abs(decrease) <= tolerance * max(1.0, cost) and self.damping <= DAMPING_START
+            else:  # as the step solves the damped system, or one with a matrix that hardly changed
+                decrease = (float(pull @ step**2 if self.damping > 0 else 0.0) - float(gradient @ step)) / 2
+            # what a kept matrix leaves shrinks by a factor only
+            enough = tolerance * max(1.0, cost) * (1.0 if kept is None else CONTRACTION)
+            small = abs(decrease) <= enough and self.damping <= DAMPING_START
             trial = self.layout.retract(self.point, step)
             if forced:
                 self.point = trial
@@ -306,7 +308,10 @@ class _Search:
                 self.point = trial
                 return Status.SOLVED, ""
             # an undamped step is nearly always taken, and its linearization gives the cost as well
-            ahead = None if small or self.damping > 0 else self.bound.linearize(trial)
+            ahead = None
+            if not small and self.damping == 0:
+                last = free and session.sparse and decrease <= NEAR * max(1.0, cost)
+                ahead = (*self.bound.gradient(trial), None) if last else self.bound.linearize(trial)
             new = self.bound.cost(trial) if ahead is None else ahead[0]
             new_violation, new_largest = self._violation(trial)
             if session.constraints.size:
@@ -329,14 +334,13 @@ class _Search:
             if not self._harder():
                 return Status.INACCURATE, f"no descent found; predicted decrease {decrease:.3g}"
 
-    def _kept_step(self, cost: float, gradient: np.ndarray, hessian: np.ndarray, tolerance: float) -> np.ndarray | None:
-        """The step of the last factorization, if it shows convergence or saves an expensive one; else None."""
-        if not self.session.settings.screen:
+    def _kept_step(self, cost: float, gradient: np.ndarray, tolerance: float) -> np.ndarray | None:
+        """The step of the last factorization, if it shows convergence or contracts well; else None."""
+        if self.gained is None or not self.session.settings.screen:
             return None
         step = -self.session._linear.solve(gradient)
-        decrease = self._decrease(gradient, hessian, step)
-        contracted = CONTRACTION * self.gained if self.session.heavy else 0.0
-        return step if abs(decrease) <= max(tolerance * max(1.0, cost), contracted) else None
+        enough = max(tolerance * max(1.0, cost), CONTRACTION * self.gained)
+        return step if abs(float(gradient @ step)) / 2 <= enough else None
 
     def _decrease(self, gradient: np.ndarray, hessian: np.ndarray, step: np.ndarray) -> float:
         return -float(gradient @ step) - self._curvature(hessian, step) / 2

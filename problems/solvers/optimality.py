@@ -23,6 +23,7 @@ from problems.forms.sparsity import HessianPattern
 from problems.solvers.base import Options, Status
 from problems.solvers.factorizations import Factorization, SingularError, factorization
 
+GROWTH = 1e8  # of a general direction by one inverse iteration, below which no direction can be without curvature
 LOOSE = 1e-13  # curvature along a direction, in the scale of the diagonal, that is none
 RIDGE = 1e-12  # of the largest diagonal entry, added so that directions the costs leave free have finite steps
 
@@ -124,10 +125,13 @@ def gauge_freedom(pattern: HessianPattern, hessian: np.ndarray, solver: Factoriz
     """
     diagonal = hessian[pattern.diagonal]
     direction = np.cos(np.arange(pattern.size))
-    for _ in range(3):
+    before = float(np.sqrt(np.sum(diagonal * direction**2)))
+    for attempt in range(3):
         direction = solver.solve(diagonal * direction)
         size = float(np.sqrt(np.sum(diagonal * direction**2)))
         if not (np.isfinite(size) and size > 0):
+            return ""
+        if attempt == 0 and size < GROWTH * before:
             return ""
         direction /= size
     columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))

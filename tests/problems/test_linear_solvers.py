@@ -72,8 +72,10 @@ def test_every_linear_solver_reaches_the_same_optimum(name: str) -> None:
         pytest.importorskip(PACKAGES[name])
     problem, truth = poses(60, np.random.default_rng(0))
     start = SE3.retract_array(truth, 0.1 * np.random.default_rng(1).normal(size=(60, 6)))
-    expected = problem.compile("gauss-newton", whole=False, linear_solver="qdldl").solve(initial={"pose": start})
-    session: Any = problem.compile("gauss-newton", whole=False, linear_solver=name)
+    expected = problem.compile("gauss-newton", whole=False, tolerance=1e-11, linear_solver="qdldl").solve(
+        initial={"pose": start}
+    )
+    session: Any = problem.compile("gauss-newton", whole=False, tolerance=1e-11, linear_solver=name)
     assert session._linear.name == name
     for one in (session, session.fork()):
         solution = one.solve(initial={"pose": start})
@@ -116,12 +118,10 @@ def test_unknown_and_missing_linear_solvers_are_named(monkeypatch: pytest.Monkey
         problem.compile("gauss-newton", whole=False, linear_solver="pardiso")
 
 
-@pytest.mark.parametrize("heavy", [False, True])
-def test_the_last_factorization_serves_again(heavy: bool) -> None:
+def test_the_last_factorization_serves_again() -> None:
     problem, truth = poses(60, np.random.default_rng(2), noise=0.15)
     start = {"pose": SE3.retract_array(truth, 0.2 * np.random.default_rng(3).normal(size=(60, 6)))}
     session: Any = problem.compile("gauss-newton", whole=False, linear_solver="qdldl")
-    session.heavy = heavy
     calls, inner = [], session._linear.factor
 
     def factor(values: np.ndarray) -> None:
@@ -131,7 +131,7 @@ def test_the_last_factorization_serves_again(heavy: bool) -> None:
     session._linear.factor = factor
     solution = session.solve(initial=start)
     assert solution.status == "solved"
-    assert len(calls) <= solution.iterations - (2 if heavy else 1)
+    assert len(calls) <= solution.iterations - 2
     exact = problem.compile("gauss-newton", whole=False, tolerance=1e-13, linear_solver="qdldl").solve(initial=start)
     assert solution.objective - exact.objective <= 1e-9 * max(1.0, exact.objective)
     # warm: one linearization and no factorization more than the test of convergence takes
