@@ -39,7 +39,7 @@ from problems.solvers.settings import own_version
 
 DAMPING_START = 1e-6
 DAMPING_LIMIT = 1e12
-NEAR = 1e-2  # share of the cost below which a decrease says that the matrix hardly changes any more
+NEAR = 1e-4  # share of the cost below which a decrease says that the matrix hardly changes, in weak directions neither
 SHORT = 1e-6  # squared length of a step that is taken without a look at the cost where its decrease shows convergence
 CONTRACTION = 0.1  # share of the last decrease below which a step with the kept matrix is taken
 RUNG_ITERATIONS = 10  # of each wider loss in graduated non-convexity
