@@ -369,13 +369,3 @@ def schemas(measurements: int, states: int, online: bool) -> tuple[Schema, Schem
     if online:
         full["covariance"] = Field((states, states), symmetric=True)
     return Schema("reading", reading), Schema("reading and estimate", full)
-
-
-class NodeFactory:
-    """Makes the nodes of a network from their plans, in any process."""
-
-    def __init__(self, plans: Sequence[NodePlan], pool: WindowPool) -> None:
-        self._plans, self._pool = tuple(plans), pool
-
-    def __call__(self, node: int) -> DistributedNode:
-        return DistributedNode(self._plans[node], self._pool)

@@ -263,13 +263,3 @@ def schemas(measurements: int, states: int) -> tuple[Schema, Schema, Schema]:
     full = {**reading, **RELAYED, "prediction": (states,)}
     weighted = {**full, "weight": Field((states, states), symmetric=True)}
     return Schema("reading", reading), Schema("reading and prediction", full), Schema("with weight", weighted)
-
-
-class RelayNodeFactory:
-    """Makes the nodes of a network from their plans, in any process."""
-
-    def __init__(self, plans: Sequence[RelayPlan], windows: RelayWindows) -> None:
-        self._plans, self._windows = plans, windows
-
-    def __call__(self, node: int) -> RelayNode:
-        return RelayNode(self._plans[node], self._windows)

@@ -9,7 +9,7 @@ import numpy as np
 from mhe.estimate import Estimate
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DetectionEstimate(Estimate):
     """An `Estimate` and what made it; `covariance` is None and ``infeasible`` names the sensors whose rows are not met.
 

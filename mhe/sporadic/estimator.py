@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from mhe.distributed.network import NetworkEstimate, NetworkRun
+from mhe.network import NetworkEstimate, NetworkRun, PlannedNodes
 from mhe.sporadic.design import SporadicDesign
-from mhe.sporadic.node import SporadicNodeFactory
+from mhe.sporadic.node import SporadicNode
 from mhe.sporadic.options import SporadicOptions
 from problems.models import Model
 from problems.networks import Network
-from problems.runtime import Links, Outage
 
 
-class SporadicEstimator(NetworkRun):
+class SporadicEstimator(NetworkRun[SporadicDesign]):
     """A network of `SporadicNode` over a simulated transport; its nodes report `DetectionEstimate`.
 
     Args:
         model, network, method, design: see `SporadicDesign`, also for the errors and warnings.
-        links, outages, rng, processes, record: see `mhe.distributed.network.NetworkRun`.
-
-    Attributes:
-        design: what was settled before the run.
-        options: of the method.
-        status: steps by status, over all nodes; ``infeasible`` counts steps whose rows had to be relaxed.
+        links, outages, rng, processes, record: see `mhe.network.NetworkRun`, which also has the attributes.
+            ``infeasible`` counts steps whose rows had to be relaxed.
 
     Example:
         >>> estimator = SporadicEstimator(model, band(12, 1), "dmhe_w_pre_s", fields=sets, gains=0.3)
@@ -34,31 +27,13 @@ class SporadicEstimator(NetworkRun):
         >>> estimate.states, estimate.nodes[3].detected
     """
 
-    def __init__(
-        self,
-        model: Model,
-        network: Network,
-        method: str | SporadicOptions = "dmhe_w_pre",
-        *,
-        links: Links | None = None,
-        outages: Iterable[Outage] = (),
-        rng: np.random.Generator | None = None,
-        processes: bool = False,
-        record: bool = False,
-        **design: Any,
-    ) -> None:
-        self.design = SporadicDesign(model, network, method, **design)
-        self.options = self.design.options
-        super().__init__(
-            self.design.model,
-            network,
-            SporadicNodeFactory(self.design.plans, self.design.pool),
-            links=links,
-            outages=outages,
-            rng=rng,
-            processes=processes,
-            record=record,
-        )
+    options: SporadicOptions
+
+    def _designed(self, model: Model, network: Network, **design: Any) -> SporadicDesign:
+        return SporadicDesign(model, network, **design)
+
+    def _nodes(self) -> PlannedNodes:
+        return PlannedNodes(SporadicNode, self.design.plans, self.design.pool)
 
     def step(
         self,

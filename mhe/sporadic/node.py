@@ -365,13 +365,3 @@ def schemas(sensors: Sensors, states: int, covariances: int) -> tuple[Schema, Sc
     }
     full = reading | {"state": (states,), "covariance": (covariances,)}
     return Schema("sporadic reading", reading), Schema("sporadic reading and estimate", full)
-
-
-class SporadicNodeFactory:
-    """Makes the nodes of a network from their plans, in any process."""
-
-    def __init__(self, plans: Sequence[SporadicPlan], pool: DetectionPool) -> None:
-        self._plans, self._pool = tuple(plans), pool
-
-    def __call__(self, node: int) -> SporadicNode:
-        return SporadicNode(self._plans[node], self._pool)
