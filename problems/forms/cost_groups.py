@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.linalg.lapack import dpotrf  # type: ignore[attr-defined]
 
 from problems.forms.kernels import CostKernel, cost_kernel
-from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, noise_numbers
+from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, constant_whitening, noise_numbers
 from problems.forms.sparsity import HessianPattern
 from problems.forms.template import template_of
 from problems.noise import whitening
@@ -51,7 +51,10 @@ def whitening_numbers(entry: TermLayout, dim: int, store: DataStore) -> np.ndarr
             root = _single_root(rows[noise.value.indices[0]].reshape(dim, dim))
             if root is not None:
                 return root
-    root = whitening(noise.kind, noise_numbers(entry.term, dim, store), dim, entry.term.count, entry.term.what)
+    if isinstance(noise.value, DataSlot):
+        root = whitening(noise.kind, noise_numbers(entry.term, dim, store), dim, entry.term.count, entry.term.what)
+    else:
+        root = constant_whitening(entry.term, dim)
     if root.ndim == 2:
         return root.T
     a, b = _upper(dim)

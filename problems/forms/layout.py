@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -43,6 +44,9 @@ def data_rows(entry: Data, value: Any) -> np.ndarray:
     raise ShapeError(f"data {entry.name!r}: expected shape {expected}, got {array.shape}")
 
 
+_WHITENINGS: WeakKeyDictionary[Term, np.ndarray] = WeakKeyDictionary()
+
+
 def check_numbers(term: Term, dim: int) -> None:
     """Weights, linear part, bounds and flags of a term with residuals of `dim` rows: shapes, NaN, crossing bounds.
 
@@ -55,7 +59,7 @@ def check_numbers(term: Term, dim: int) -> None:
         allowed = {(dim,) if noise.kind == "sigma" else (dim, dim)} | ({(), (1,)} if single else set())
         _check_slot(noise.value, allowed, term, noise.kind)
     elif noise is not None:
-        whitening(noise.kind, noise.value, dim, term.count, term.what)
+        constant_whitening(term, dim)
     given = {}
     for key, size in (("linear", dim), ("lower", dim), ("upper", dim), ("active", 1)):
         value = getattr(term, key)
@@ -76,6 +80,15 @@ def check_numbers(term: Term, dim: int) -> None:
                 f"{term.what}: no point satisfies instance {row}, row {part}: lower "
                 f"{given['lower'][row, part]:g} is above upper {given['upper'][row, part]:g}"
             )
+
+
+def constant_whitening(term: Term, dim: int) -> np.ndarray:
+    """`problems.noise.whitening` of a noise model that is no data, worked out once for each term."""
+    found = _WHITENINGS.get(term)
+    if found is None:
+        assert term.noise is not None
+        found = _WHITENINGS[term] = whitening(term.noise.kind, term.noise.value, dim, term.count, term.what)
+    return found
 
 
 def noise_numbers(term: Term, dim: int, store: DataStore) -> Any:

@@ -125,25 +125,28 @@ class HessianPattern:
         slot_of = np.repeat(np.arange(len(slot_dims)), slot_dims)
         local = _ramp(np.array(slot_dims))
         out = np.empty((len(pairs), entry.term.count), np.intp)
-        twice = []
-        cache: dict[tuple[int, int], np.ndarray] = {}
+        twice = np.full(out.shape, -1) if _repeats(entry) else None
+        groups: dict[tuple[int, int], list[int]] = {}
         for k, (p, q) in enumerate(pairs):
-            s, t = slot_of[p], slot_of[q]
+            groups.setdefault((slot_of[p], slot_of[q]), []).append(k)
+        for (s, t), group in groups.items():
+            p, q = np.array([pairs[k] for k in group]).T[:, :, None]
             bi, bj = entry.blocks[:, s], entry.blocks[:, t]
-            if (s, t) not in cache:
-                cache[s, t] = self._above[np.searchsorted(self._unique, _key(bi, bj, self.blocks))]
-            up = cache[s, t]
+            up = self._above[np.searchsorted(self._unique, _key(bi, bj, self.blocks))]
             ci, cj = self._start[bi] + local[p], self._start[bj] + local[q]
-            swap = ci > cj
-            column, inner = np.where(swap, ci, cj), np.where(swap, local[q], local[p])
-            out[k] = self.indptr[column] + up + inner
-            if p != q and (ci == cj).any():
-                twice.append(np.where(ci == cj, out[k], -1))
-            else:
-                twice.append(None)
-        if all(t is None for t in twice):
-            return out, None
-        return out, np.array([np.full(entry.term.count, -1) if t is None else t for t in twice])
+            at = self.indptr[cj] + local[p]
+            if s != t:
+                at = np.where(ci > cj, self.indptr[ci] + local[q], at)
+            out[group] = at + up
+            if twice is not None and s != t:
+                twice[group] = np.where(ci == cj, out[group], -1)
+        return out, twice
+
+
+def _repeats(entry: TermLayout) -> bool:
+    """Whether one instance fills two slots of the term."""
+    blocks = np.sort(entry.blocks, axis=1)
+    return bool((blocks[:, 1:] == blocks[:, :-1]).any())
 
 
 def _key(a: np.ndarray, b: np.ndarray, blocks: int) -> np.ndarray:
