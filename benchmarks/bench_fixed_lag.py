@@ -12,6 +12,7 @@ import resource
 import numpy as np
 import pytest
 
+from benchmarks.record import Row, record
 from localization import measurements as meas
 from localization.smoothing import FixedLagSmoother, Kind, Readings
 from problems.noise import Gaussian
@@ -55,6 +56,8 @@ def test_step_time_does_not_depend_on_run_length(lag: int) -> None:
         f"first block {1e6 * medians[0]:.0f}, last {1e6 * medians[-1]:.0f} us, exponent {exponent:+.3f}; peak memory "
         f"grew by {grown} kB after keyframe {2 * BLOCK}; error {np.sqrt(np.mean(error**2)):.3f} m"
     )
+    name = f"growth with run length, fixed-lag step, lag {lag}"
+    record(Row(name, "", float(abs(exponent)), unit="(exponent)", wanted=0.15))
     assert abs(exponent) < 0.15
     assert grown < 4096  # kB; a thousand bytes kept from every keyframe would be 9 000
     assert np.sqrt(np.mean(error**2)) < 0.5

@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from benchmarks.record import Row, compared, record
 from mhe import Polyhedron, mhe
 from problems import NonlinearModel, Sensor, simulate
 
@@ -31,6 +32,7 @@ TOLERANCE = 1e-8
 ANCHORS = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]])
 # their median time over ours, at least
 WANTED = {"do-mpc": 35.0, "Opti ipopt": 20.0, "Opti fatrop": 12.0, "expanded ipopt": 7.0, "expanded fatrop": 1.8}
+GOALS = {"do-mpc": 100.0, "Opti ipopt": 25.0, "Opti fatrop": 12.0}
 DT = 0.1
 
 
@@ -311,6 +313,16 @@ def test_step_beside_do_mpc_ipopt_and_fatrop(capsys: pytest.CaptureFixture[str])
                 f"{away[name]:.0e} m, compile {1e3 * compiled[name]:.0f} ms, {ratios[name]:6.1f} times ours "
                 f"({spread.min():.1f} to {spread.max():.1f} by block)"
             )
+    measure = f"nonlinear MHE step, unicycle, horizon {N}"
+    for name in (*sides, *({"do-mpc"} - sides.keys())):
+        if name in ratios and name != "ours":
+            compared(
+                measure, name, times["ours"], times[name], block=BLOCK, wanted=GOALS.get(name),
+                compiled=(compiled["ours"], compiled[name]),
+            )  # fmt: skip
+        elif name != "ours":
+            reason = "not compared: not installed" if name not in sides else f"not reached: {away[name]:.0e} m away"
+            record(Row(measure, name, median["ours"], wanted=GOALS.get(name), note=reason))
     assert away["ours"] <= CLOSE
     for name, wanted in WANTED.items():
         if name in sides:
@@ -359,4 +371,5 @@ def test_a_step_grows_linearly_with_the_horizon(capsys: pytest.CaptureFixture[st
     with capsys.disabled():
         steps = ", ".join(f"N = {n}: {1e6 * s:.0f} us" for n, s in zip(horizons, seconds, strict=True))
         print(f"\nprocess noise, step {steps}; grows as N^{exponent:.2f}")
+    record(Row("growth with N, nonlinear, process noise, N = 40 to 160", "", exponent, unit="(exponent)", wanted=1.15))
     assert exponent < 1.15

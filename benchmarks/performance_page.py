@@ -99,8 +99,8 @@ def page(found: list[Row]) -> str:
         "# Performance",
         "Written by `make bench`; do not edit. Both sides run in turns in one process with one thread, after a check "
         "that they found the same optimum (a benchmark fails where they did not). Ratios are the peer's median time "
-        "over ours: above 1 ours is faster. The spread is that of the ratio over blocks of repetitions. What compilation "
-        "costs, once per problem, is beside it where the time does not contain it.",
+        "over ours: above 1 ours is faster. The spread is that of the ratio over blocks of repetitions. What "
+        "compilation costs, once per problem, is beside it where the time does not contain it.",
         f"Measured on {date.today()}: {processor()}, {os.cpu_count()} processors, {platform.system()}; {versions()}"
         + (f"; commit {commit.stdout.strip()}" if commit.returncode == 0 else "")
         + ". Other programs may have run beside.",
