@@ -83,14 +83,15 @@ class WindowEstimate(Estimate):
     """An `Estimate` of a moving horizon estimator.
 
     Attributes:
-        solution: of the window's problem: residuals, multipliers, objective, active set; None where nothing was solved.
+        solution: of the window's problem: residuals, multipliers, objective, active set; None where nothing was solved,
+            and in an estimate that comes from another process: what it is worked out from stays there.
         parameters: (r,) estimated or given, or None.
         too_late: times (s) of late measurements whose instant had already left the window; they were not used.
     """
 
     solution: Solution | None
-    parameters: np.ndarray | None
     too_late: tuple[float, ...]
+    parameters: np.ndarray | None = None
 
     def __init__(self, fields: dict[str, Any]) -> None:
         # the covariance is worked out on access, so the fields go in directly
@@ -99,16 +100,21 @@ class WindowEstimate(Estimate):
     @property
     def covariance(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """(n, n) of `state` by the window's own costs, bounds left out; None with pre-estimation, whose observer has no
-        noise model, and where the step found no solution.
+        noise model, for nodes of a network, whose neighbours' estimates are correlated with their own, and where the
+        step found no solution.
 
         Raises:
             UnobservableError: the costs leave a direction free.
         """
-        known = self.__dict__.get("_covariance")
-        if known is None and self.__dict__["_slot"] is not None:
+        known, slot = self.__dict__.get("_covariance"), self.__dict__.get("_slot")
+        if known is None and slot is not None:
             assert self.solution is not None
-            known = self.__dict__["_covariance"] = self.solution.covariance(self.__dict__["_slot"])
+            known = self.__dict__["_covariance"] = self.solution.covariance(slot)
         return known
+
+    def __getstate__(self) -> dict[str, Any]:
+        # a solution holds on to compiled code, which does not travel between processes
+        return self.__dict__ | {"_covariance": self.covariance, "_slot": None, "solution": None}
 
 
 @runtime_checkable

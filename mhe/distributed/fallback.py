@@ -12,10 +12,21 @@ from mhe.distributed.pool import WindowPool
 from mhe.polyhedron import Polyhedron
 from problems.models import LinearModel
 from problems.solvers.base import Status
-from problems.solvers.session import Session
+from problems.solvers.session import Session, Solution
 
 SOLVED = (Status.SOLVED, Status.INACCURATE)
 STOPPED = (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
+
+
+def usable(solution: Solution) -> bool:
+    """Whether the states of a solution are worth more than a prediction."""
+    return solution.status in SOLVED or (solution.status in STOPPED and solution.iterations > 0)
+
+
+def data_of(session: Session) -> dict[str, Any]:
+    """All data that a session has, to give them to a relaxed one."""
+    store, inputs = session.store, session.problem.inputs.items()
+    return {name: store[name] for name, entry in inputs if entry.of is None}
 
 
 def predicted(model: LinearModel, before: np.ndarray, inputs: np.ndarray, newest: int, slid: bool) -> np.ndarray:

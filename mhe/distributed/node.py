@@ -5,7 +5,7 @@ Source: dmhe-pre-estimation 4.2 (Algorithm 1) with errata E1-E3; missing neighbo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from time import perf_counter
 from typing import Any
 
@@ -20,34 +20,30 @@ from mhe.covariance import (
     symmetrized,
     window_information,
 )
-from mhe.distributed.fallback import SOLVED, STOPPED, Fallback, predicted
+from mhe.distributed.fallback import STOPPED, Fallback, data_of, predicted, usable
 from mhe.distributed.plan import NodePlan
 from mhe.distributed.pool import WindowPool
-from mhe.estimate import Estimate
-from problems.errors import DataError, ShapeError
+from mhe.estimate import WindowEstimate
+from mhe.node import OneMessageNode, own_reading
+from problems.errors import DataError
 from problems.runtime import Message, NeighborMemory, Outgoing, Schema
 from problems.runtime.message import Field
 from problems.solvers.base import Status
-from problems.solvers.session import Session
+from problems.solvers.session import Session, Solution
 
 
-class DistributedNode:
+class DistributedNode(OneMessageNode):
     """Estimates the state from the measurements of its in-neighbourhood and the estimates of its in-neighbours.
 
     One message per step goes to all out-neighbours: the measurement y_t, the state of instant s_t = max(0, t - N) as
-    estimated in the step before, and its covariance unless that was worked out off-line. `finish` returns an
-    `Estimate`. A node that (re)starts later than instant 0 has nothing but its plan: it treats earlier measurements as
-    missing, earlier inputs as zero, and takes its prior from the neighbours it hears.
+    estimated in the step before, and its covariance unless that was worked out off-line. `finish` returns a
+    `WindowEstimate` without covariance. A node that (re)starts later than instant 0 has nothing but its plan: it treats
+    earlier measurements as missing, earlier inputs as zero, and takes its prior from the neighbours it hears.
 
     Args:
         plan: what the node is told before the run.
         pool: where its window is compiled.
-
-    Attributes:
-        rounds: no exchange beyond the one message.
     """
-
-    rounds = 0
 
     def __init__(self, plan: NodePlan, pool: WindowPool | None = None) -> None:
         self._plan, self._pool = plan, WindowPool() if pool is None else pool
@@ -113,7 +109,7 @@ class DistributedNode:
             DataError: infinite numbers, or no input where the model has inputs.
         """
         instant = round(time / self._plan.period)
-        y, u = self._reading(measurement, instant)
+        y, u = own_reading(measurement, self._own_size, self._model.input_size, instant, self._plan.label)
         self._advance(instant, u)
         self._y[self._newest, self._plan.member_rows[self._plan.own]] = y
         self._time = float(time)
@@ -127,73 +123,53 @@ class DistributedNode:
         self._memory.receive(self._plan.index, self._time, self._published, covariance)
         return (full.message(y=y, state=self._published, covariance=covariance),)
 
-    def exchange(self, index: int, inbox: list[Message]) -> Iterable[Outgoing]:
-        """Never called: the node speaks once per step."""
-        return ()
-
-    def finish(self, inbox: list[Message]) -> Estimate:
+    def finish(self, inbox: list[Message]) -> WindowEstimate:
         """Hear the neighbours, solve the local problem and publish.
 
         Raises:
             DataError: a message from a stranger or of another definition.
         """
         started = perf_counter()
-        current, late = self._hear(inbox)
+        current, late, too_late = self._hear(inbox)
         newest = self._newest
         missing = ()
         if np.isnan(self._y[newest]).any():
             missing = tuple(np.flatnonzero(np.isnan(self._y[newest])).tolist())
-        status, infeasible = Status.SOLVED, ()
+        status, infeasible, solution = Status.SOLVED, (), None
         if self._now == 0:
             self._published = self._mean
         else:
             self._arrival(current)
-            status, infeasible = self._solve()
+            status, infeasible, solution = self._solve()
             # s_{t+1} = s_t while the window grows, then the next instant
             self._published = self._states[1 if newest == self._horizon else 0].copy()
-        return Estimate(
-            state=self._states[newest].copy(),
-            covariance=None,
-            window=self._states[: newest + 1].copy(),
-            status=status,
-            seconds=perf_counter() - started,
-            infeasible=infeasible,
-            missing=missing,
-            late=late,
-            time=self._time,
-            state_names=self._model.state_names,
+        return WindowEstimate(
+            {
+                "state": self._states[newest].copy(),
+                "window": self._states[: newest + 1].copy(),
+                "status": status,
+                "seconds": perf_counter() - started,
+                "infeasible": infeasible,
+                "missing": missing,
+                "late": late,
+                "too_late": too_late,
+                "time": self._time,
+                "state_names": self._model.state_names,
+                "solution": solution,
+            }
         )
 
     # Measurements and messages
 
-    def _reading(self, measurement: Any, instant: int) -> tuple[np.ndarray, np.ndarray]:
-        size, m = self._own_size, self._model.input_size
-        given, inputs = measurement if m and measurement is not None else (measurement, None)
-        y = np.full(size, np.nan) if given is None else np.asarray(given, dtype=float)
-        if y.shape != (size,):
-            if y.size != size:
-                raise ShapeError(f"node {self._plan.label}: expected {size} measurement(s), got shape {y.shape}")
-            y = y.reshape(size)
-        if np.isinf(y).any():
-            raise DataError(f"node {self._plan.label}: an infinite measurement at time step {instant}")
-        if inputs is None:
-            if m and instant:
-                raise DataError(f"node {self._plan.label}: the model needs {m} input(s) at time step {instant}")
-            return y, np.zeros(m)
-        u = np.asarray(inputs, dtype=float)
-        if u.shape != (m,) or not np.isfinite(u).all():
-            raise DataError(f"node {self._plan.label}: expected {m} finite input(s), got {inputs!r}")
-        return y, u
-
-    def _advance(self, instant: int, u: np.ndarray) -> None:
+    def _advance(self, instant: int, u: np.ndarray | None) -> None:
         """Move the window on to `instant`."""
-        N = self._horizon
+        N, driven = self._horizon, self._model.input_size > 0
         first = self._now < 0
         before = instant if first else self._now
         for step in range(before + 1, instant + 1):
             if step > N:
                 self._y[:-1] = self._y[1:]
-                if u.size:
+                if driven:
                     self._older[:-1] = self._older[1:]
                     self._older[-1:] = self._u[:1]
                     self._u[:-1] = self._u[1:]
@@ -201,20 +177,22 @@ class DistributedNode:
             self._u[min(step, N)] = 0.0
         self._slid = instant > N
         self._now, self._newest = instant, min(instant, N)
-        self._u[self._newest] = u
-        if u.size:
+        if driven:
+            self._u[self._newest] = 0.0 if u is None else u
             self._data["u"] = self._u
         if self._window.bounds and (first or not self._slid or before < N):
             self._data["filled"] = (np.arange(N + 1) <= self._newest).astype(float)
 
-    def _hear(self, inbox: Sequence[Message]) -> tuple[list[np.ndarray] | None, tuple[float, ...]]:
+    def _hear(self, inbox: Sequence[Message]) -> tuple[list[np.ndarray] | None, tuple[float, ...], tuple[float, ...]]:
         """Take over what was received.
 
         Returns:
-            The states of all members in their order if all spoke in this step, else None; times of late measurements.
+            The states of all members in their order if all spoke in this step, else None; times of late measurements,
+            and of those whose instant has left the window.
         """
         heard: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         late: list[float] = []
+        too_late: list[float] = []
         for message in inbox:
             place = self._place.get(message.sender)
             if place is None:
@@ -227,6 +205,8 @@ class DistributedNode:
                 self._y[slot, self._plan.member_rows[place]] = values["y"]
                 if slot < self._newest:
                     late.append(message.time)
+            elif slot < 0:
+                too_late.append(message.time)
             if not complete:
                 continue
             covariance = values.get("covariance")
@@ -234,10 +214,10 @@ class DistributedNode:
             if message.time == self._time:
                 heard[message.sender] = values["state"], covariance
         if self._published is None or len(heard) < len(self._place) - 1:
-            return None, tuple(late)
+            return None, tuple(late), tuple(too_late)
         heard[self._plan.index] = self._published, self._own_covariance
         self._covariances = [heard[member][1] for member in self._plan.members]
-        return [heard[member][0] for member in self._plan.members], tuple(late)
+        return [heard[member][0] for member in self._plan.members], tuple(late), tuple(too_late)
 
     def _propagate(self, state: np.ndarray, age: int) -> np.ndarray:
         """A neighbour's published state of `age` steps ago, brought to the first instant of the present window."""
@@ -340,22 +320,19 @@ class DistributedNode:
 
     # Local problem
 
-    def _solve(self) -> tuple[Status, tuple[str, ...]]:
+    def _solve(self) -> tuple[Status, tuple[str, ...], Solution]:
         before = self._states
         data, self._data = self._data, {"y": self._flat} if self._model.measurement_size else {}
         solution = self._session.solve(data)
         status = solution.status
-        if status in SOLVED or (status in STOPPED and solution.iterations):
+        if usable(solution):
             self._states = solution["x"]
-            return status, ()
+            return status, (), solution
         self._states = predicted(self._model, before, self._u, self._newest, self._slid)
         if status is not Status.INFEASIBLE:
-            return Status.FAILED if status in STOPPED else status, ()
-        store = self._session.store
-        inputs = self._session.problem.inputs.items()
-        data = {name: store[name] for name, entry in inputs if entry.of is None}
-        self._states, unmet = self._fallback(data, self._states, self._newest)
-        return status, tuple(unmet)
+            return Status.FAILED if status in STOPPED else status, (), solution
+        self._states, unmet = self._fallback(data_of(self._session), self._states, self._newest)
+        return status, tuple(unmet), solution
 
 
 def _settled(before: np.ndarray, after: np.ndarray) -> bool:

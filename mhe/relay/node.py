@@ -6,27 +6,26 @@ Source: dmhe-l-step, Algorithm 2, errata 1, 5, 7, 8; missing neighbours by the r
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from mhe.distributed.fallback import SOLVED, STOPPED, predicted
-from mhe.estimate import Estimate
+from mhe.distributed.fallback import STOPPED, data_of, predicted, usable
+from mhe.estimate import WindowEstimate
+from mhe.node import OneMessageNode, own_reading
 from mhe.relay.buffer import RELAYED, RelayBuffer
 from mhe.relay.fusion import Fusion
 from mhe.relay.plan import RelayPlan
 from mhe.relay.windows import Relaxation, RelayWindows
-from problems.errors import DataError, ShapeError, TopologyError
+from problems.errors import TopologyError
 from problems.runtime import Field, Message, Outgoing, Schema
 from problems.solvers.base import Status
-from problems.solvers.session import Session
+from problems.solvers.session import Session, Solution
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class RelayEstimate(Estimate):
-    """An `Estimate` of a node with relayed measurements.
+class RelayEstimate(WindowEstimate):
+    """A `WindowEstimate` of a node with relayed measurements; it has no covariance.
 
     Attributes:
         held: (length, p) bool, components of the regional measurement that were used, slot by slot.
@@ -37,7 +36,7 @@ class RelayEstimate(Estimate):
     factorized: bool
 
 
-class RelayNode:
+class RelayNode(OneMessageNode):
     """Estimates the state from measurements relayed over l hops and the fused arrival costs of its in-neighbours.
 
     One message per step goes to all out-neighbours: the measurement y_t, the entries sent on (source, instant, hops,
@@ -49,12 +48,7 @@ class RelayNode:
     Args:
         plan: what the node is told before the run.
         windows: where its window is compiled.
-
-    Attributes:
-        rounds: no exchange beyond the one message.
     """
-
-    rounds = 0
 
     def __init__(self, plan: RelayPlan, windows: RelayWindows | None = None) -> None:
         self._plan, model = plan, plan.model
@@ -94,7 +88,9 @@ class RelayNode:
             DataError: infinite numbers, or no input where the model has inputs.
         """
         instant = round(time / self._plan.period)
-        y, u = self._reading(measurement, instant)
+        y, u = own_reading(
+            measurement, len(self._plan.own_output), self._plan.model.input_size, instant, self._plan.label
+        )
         self._slid = instant > self._horizon and self._now >= 0
         self._now, self._time = instant, float(time)
         if u is not None:
@@ -110,10 +106,6 @@ class RelayNode:
         weight = self._fusion.own_weight(instant)
         return (full.message(**said) if weight is None else weighted.message(**said, weight=weight),)
 
-    def exchange(self, index: int, inbox: list[Message]) -> Iterable[Outgoing]:
-        """Never called: the node speaks once per step (Remark 9)."""
-        return ()
-
     def finish(self, inbox: list[Message]) -> RelayEstimate:
         """Hear the neighbours, solve the local problem and predict.
 
@@ -122,50 +114,36 @@ class RelayNode:
             DataError: a message of another definition.
         """
         started = perf_counter()
-        late = self._hear(inbox)
+        late, too_late = self._hear(inbox)
         newest, held = self._buffer.newest, self._buffer.held
-        status, infeasible, factorized = Status.SOLVED, (), False
+        status, infeasible, factorized, solution = Status.SOLVED, (), False, None
         if self._now:
-            status, infeasible, factorized = self._solve()
+            status, infeasible, factorized, solution = self._solve()
         self._published = self._predict()
         return RelayEstimate(
-            state=self._states[newest].copy(),
-            covariance=None,
-            window=self._states[: newest + 1].copy(),
-            status=status,
-            seconds=perf_counter() - started,
-            infeasible=infeasible,
-            missing=tuple(np.flatnonzero(self._plan.held[-1] & ~held[-1]).tolist()),
-            late=late,
-            time=self._time,
-            state_names=self._plan.model.state_names,
-            held=held,
-            factorized=factorized,
+            {
+                "state": self._states[newest].copy(),
+                "window": self._states[: newest + 1].copy(),
+                "status": status,
+                "seconds": perf_counter() - started,
+                "infeasible": infeasible,
+                "missing": tuple(np.flatnonzero(self._plan.held[-1] & ~held[-1]).tolist()),
+                "late": late,
+                "too_late": too_late,
+                "time": self._time,
+                "state_names": self._plan.model.state_names,
+                "solution": solution,
+                "held": held,
+                "factorized": factorized,
+            }
         )
 
     # Measurements and messages
 
-    def _reading(self, measurement: Any, instant: int) -> tuple[np.ndarray, np.ndarray | None]:
-        size, m = len(self._plan.own_output), self._plan.model.input_size
-        given, inputs = measurement if m and measurement is not None else (measurement, None)
-        y = np.full(size, np.nan) if given is None else np.asarray(given, dtype=float)
-        if y.size != size:
-            raise ShapeError(f"node {self._plan.label}: expected {size} measurement(s), got shape {y.shape}")
-        y = y.reshape(size)
-        if np.isinf(y).any():
-            raise DataError(
-                f"node {self._plan.label}: an infinite measurement at time step {instant}; a missing one is NaN"
-            )
-        if not m or (inputs is None and not instant):
-            return y, None
-        u = np.full(m, np.nan) if inputs is None else np.asarray(inputs, dtype=float)
-        if u.shape != (m,) or not np.isfinite(u).all():
-            raise DataError(f"inputs: the model needs {m} finite number(s) at time step {instant}, got {inputs!r}")
-        return y, u
-
-    def _hear(self, inbox: Sequence[Message]) -> tuple[float, ...]:
-        """Take over what was received; times of the measurements that came late."""
-        late = []
+    def _hear(self, inbox: Sequence[Message]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Take over what was received; times of the neighbours' measurements that came late, and too late."""
+        late: list[float] = []
+        too_late: list[float] = []
         for message in inbox:
             if message.sender not in self._schemas:
                 raise TopologyError(
@@ -177,11 +155,13 @@ class RelayNode:
             full = "prediction" in values
             if self._buffer.receive(message.sender, instant, values["y"], values if full else None):
                 late += [message.time] if instant < self._now else []
+            elif instant < self._now - self._horizon and not np.isnan(values["y"]).all():
+                too_late.append(message.time)
             if full:
                 self._fusion.receive(message.sender, message.time, values["prediction"], values.get("weight"))
             elif instant:
                 self._fusion.repeat()  # it has just started and knows no weights
-        return tuple(late)
+        return tuple(late), tuple(too_late)
 
     def _unpacked(self, message: Message) -> dict[str, np.ndarray]:
         known = self._schemas[message.sender]
@@ -213,7 +193,7 @@ class RelayNode:
             predicted = predicted + plan.own_gain @ np.nan_to_num(y - plan.own_output @ first)
         return predicted
 
-    def _solve(self) -> tuple[Status, tuple[str, ...], bool]:
+    def _solve(self) -> tuple[Status, tuple[str, ...], bool, Solution]:
         plan, newest = self._plan, self._buffer.newest
         reference, information, linear = self._fusion.arrival(self._now)
         data: dict[str, Any] = {"reference": reference[None], "linear": linear[None]}
@@ -236,21 +216,19 @@ class RelayNode:
         before = self._states
         solution = self._session.solve(data | changed)
         status = solution.status
-        if status in SOLVED or (status in STOPPED and solution.iterations):
+        if usable(solution):
             self._states = solution["x"]
-            return status, (), factorized
+            return status, (), factorized, solution
         inputs = np.array([self._input(self._now - newest + slot) for slot in range(self._horizon + 1)])
         self._states = predicted(plan.model, before, inputs, newest, self._slid)
         if status is not Status.INFEASIBLE:
-            return Status.FAILED if status in STOPPED else status, (), factorized
+            return Status.FAILED if status in STOPPED else status, (), factorized, solution
         if plan.options.bounds == "soft":
-            store = self._session.store
-            entries = self._session.problem.inputs.items()
-            relaxed = self._relax({name: store[name] for name, entry in entries if entry.of is None}, newest)
+            relaxed = self._relax(data_of(self._session), newest)
             if relaxed is not None:
                 self._states, unmet = relaxed
-                return Status.SOLVED, self._named(unmet), factorized
-        return status, self._named(f"{name} bounds" for name in self._window.bounds), factorized
+                return Status.SOLVED, self._named(unmet), factorized, solution
+        return status, self._named(f"{name} bounds" for name in self._window.bounds), factorized, solution
 
     def _named(self, bounds: Iterable[str]) -> tuple[str, ...]:
         """Names of bounds with this node's sensors; its window may have been compiled for another one."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mhe.distributed.fallback import SOLVED, STOPPED
+from mhe.distributed.fallback import SOLVED, STOPPED, usable
 from mhe.sporadic.numbers import RegionNumbers
 from mhe.sporadic.pieces import PieceSearch
 from mhe.sporadic.plan import SporadicPlan
@@ -70,7 +70,7 @@ class LocalProblem:
             data["row active"] = active.reshape(-1, 1)
         solution = self._session.solve(data)
         status = solution.status
-        if status in SOLVED or (status in STOPPED and solution.iterations):
+        if usable(solution):
             if plan.options.rows == "soft" and status in SOLVED and solution.method != "linear" and self._too_dear():
                 return self._soft(data, predict)
             if self._pieces is None or active is None or status is not Status.SOLVED:
