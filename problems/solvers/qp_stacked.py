@@ -121,7 +121,7 @@ def _bound(bound: Bounds, numbers: np.ndarray) -> np.ndarray:
     if not bound.index.size or bound.index.max() < 0:
         return bound.constant[None]
     given = np.where(bound.index >= 0, numbers[:, bound.index], bound.constant)
-    return np.where(np.abs(given) >= INFINITE, np.sign(given) * np.inf, given)
+    return np.where(np.abs(given) >= INFINITE, np.copysign(np.inf, given), given)
 
 
 @dataclass(eq=False)
