@@ -345,17 +345,15 @@ SE3 = _SE3()
 
 def quaternion_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Products (count, 4) of quaternions (x, y, z, w), row by row."""
-    ax, ay, az, aw = np.moveaxis(a, -1, 0)
-    bx, by, bz, bw = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bx + bw * ax + ay * bz - az * by,
-            aw * by + bw * ay + az * bx - ax * bz,
-            aw * bz + bw * az + ax * by - ay * bx,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ],
-        axis=-1,
-    )
+    ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
+    bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
+    w = aw * bw - ax * bx - ay * by - az * bz
+    out = np.empty((*w.shape, 4))
+    out[..., 0] = aw * bx + bw * ax + ay * bz - az * by
+    out[..., 1] = aw * by + bw * ay + az * bx - ax * bz
+    out[..., 2] = aw * bz + bw * az + ax * by - ay * bx
+    out[..., 3] = w
+    return out
 
 
 def quaternion_conjugate(q: np.ndarray) -> np.ndarray:
@@ -365,7 +363,7 @@ def quaternion_conjugate(q: np.ndarray) -> np.ndarray:
 
 def quaternion_exp(vectors: np.ndarray) -> np.ndarray:
     """Unit quaternions (count, 4) of rotation vectors (count, 3), rad."""
-    half = np.linalg.norm(vectors, axis=-1, keepdims=True) / 2
+    half = np.sqrt(np.einsum("...k,...k", vectors, vectors))[..., None] / 2
     return np.concatenate([np.sinc(half / np.pi) / 2 * vectors, np.cos(half)], axis=-1)
 
 
@@ -381,10 +379,17 @@ def quaternion_log(q: np.ndarray) -> np.ndarray:
 
 def rotate_array(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Vectors (count, 3) turned by unit quaternions (count, 4), row by row."""
-    u = q[..., :3]
-    t = 2 * np.cross(u, vectors)
-    return vectors + q[..., 3:] * t + np.cross(u, t)
+    # np.cross takes longer than all the rest where rows are few
+    ux, uy, uz, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    vx, vy, vz = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    tx, ty, tz = 2 * (uy * vz - uz * vy), 2 * (uz * vx - ux * vz), 2 * (ux * vy - uy * vx)
+    x = vx + w * tx + uy * tz - uz * ty
+    out = np.empty((*x.shape, 3))
+    out[..., 0] = x
+    out[..., 1] = vy + w * ty + uz * tx - ux * tz
+    out[..., 2] = vz + w * tz + ux * ty - uy * tx
+    return out
 
 
 def _unit(q: np.ndarray) -> np.ndarray:
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return q / np.sqrt(np.einsum("...k,...k", q, q))[..., None]

@@ -6,12 +6,14 @@ zero, which removes a gauge freedom without touching the rest of the Hessian.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from problems.forms.layout import Layout, TermLayout
-from problems.forms.residual_code import residual_code
+from problems.forms.residual_code import ResidualCode, residual_code
 from problems.forms.sparsity import HessianPattern
-from problems.forms.template import template_of
+from problems.forms.template import Template, template_of
 
 
 class Pins:
@@ -82,8 +84,12 @@ def _fixes(entry: TermLayout) -> bool:
         return False
     if any(slot.source.of is not None for slot in term.data):
         return False
-    general = list(np.cos(np.arange(1.0, entry.stored.shape[1] + entry.numbers.shape[1] + 1.0)))
-    J = residual_code(term).residual_and_jacobian(general, 1)[1][0]
+    return _determines(template, residual_code(term), entry.stored.shape[1] + entry.numbers.shape[1])
+
+
+@lru_cache(maxsize=1024)
+def _determines(template: Template, code: ResidualCode, inputs: int) -> bool:
+    J = code.residual_and_jacobian(list(np.cos(np.arange(1.0, inputs + 1.0))), 1)[1][0]
     return bool(np.isfinite(J).all()) and int(np.linalg.matrix_rank(J)) == template.width
 
 

@@ -111,12 +111,13 @@ class HessianPattern:
             for height in np.unique(dims):
                 pick = np.flatnonzero((dims[col] == width) & (dims[row] == height))
                 c, r, up = col[pick], row[pick], self._above[pick]
-                same = c == r
-                for b in range(width):
-                    at = self.indptr[self._start[c] + b] + up
-                    for a in range(height):
-                        use = ~same | (a <= b)
-                        indices[at[use] + a] = self._start[r[use]] + a
+                if not pick.size:
+                    continue
+                a, b = np.arange(height), np.arange(width)
+                at = (self.indptr[self._start[c][:, None] + b] + up[:, None])[:, :, None] + a
+                rows = np.broadcast_to(self._start[r][:, None, None] + a, at.shape)
+                use = (c != r)[:, None, None] | (a <= b[:, None])
+                indices[at[use]] = rows[use]
         return indices
 
     def _positions(self, entry: TermLayout, pairs: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray | None]:
