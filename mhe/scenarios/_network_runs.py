@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from mhe.centralized import MovingHorizonEstimator
-from mhe.distributed import DistributedEstimator, NetworkEstimate
+from mhe.distributed import DistributedEstimator
 from mhe.estimate import Estimate, WindowEstimate
+from mhe.network import NetworkEstimate, NetworkRun
 from mhe.polyhedron import Polyhedron
 from mhe.scenarios._network_world import METHODS, AnyEstimator, Drawn, Gains, NetworkSettings, World, make_estimator
-from problems.bench.scenario import Outcome
+from problems.bench.scenario import Curve, Outcome
+from problems.display import new_figure
 from problems.errors import ModelWarning
 from problems.solvers.base import Status
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
 COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")  # told apart without colour vision
 AT_BOUND = 1e-6
+REFERENCE_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +49,12 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """An estimator with everything compiled, what that cost (s), and its options."""
+    """An estimator with everything compiled, what that cost (s), its options, and what it warned of."""
 
     estimator: AnyEstimator
     seconds: float
     options: Mapping[str, Any]
+    warned: tuple[Warning, ...] = ()
 
 
 class NetworkScenario(ABC):
@@ -79,15 +83,13 @@ class NetworkScenario(ABC):
         """Metrics from error norms (duration + 1, nodes)."""
 
     def run(self, settings: Any, method: str, solver: str, drawn: Drawn) -> Outcome:
-        if settings.bounds == "none":
-            prepared = self._prepared(settings, method, solver)
-        else:  # the box is the trial's own
-            prepared = self._prepare(settings, method, solver, drawn)
-        estimator = prepared.estimator
-        rows = slice(None) if hasattr(estimator, "network") else self.world(settings).rows
-        record = recorded(estimator, drawn.measurements[:, rows], None if settings.bounds == "none" else drawn.box)
+        prepared = self._prepared(settings, method, solver, drawn)
+        for warned in prepared.warned:  # in every trial, also where an earlier one prepared the estimator
+            warnings.warn(warned, stacklevel=2)
+        record = self._recorded(prepared.estimator, settings, drawn)
         warn_of_infeasible(method, record.infeasible)
-        errors = np.linalg.norm(np.array(record.states) - drawn.states[:, None], axis=-1)
+        states = np.array(record.states)
+        errors = np.linalg.norm(states - drawn.states[:, None], axis=-1)
         return Outcome(
             metrics=self.score(errors),
             options=prepared.options,
@@ -96,23 +98,49 @@ class NetworkScenario(ABC):
             status=record.status,
             iterations=record.iterations,
             residual=record.residual,
+            curves={"error": Curve(errors.mean(axis=1))},
+            estimate=states,
             trace=Trace(errors, np.array(record.active), tuple(record.infeasible)),
         )
 
+    def reference(self, settings: Any, method: str, drawn: Drawn) -> np.ndarray | None:
+        """States (duration + 1, nodes, 4) at the optima of the same windows, solved much more tightly."""
+        if method not in METHODS or method in self.without_solver:
+            return None
+        exact = settings.model_copy(update={"tolerance": REFERENCE_TOLERANCE, "form": "auto", "warm": True})
+        key = method, exact
+        if key not in drawn.references:
+            estimator = self._prepared(exact, method, "daqp", drawn).estimator
+            drawn.references[key] = np.array(self._recorded(estimator, exact, drawn).states)
+        return drawn.references[key]
+
+    def _recorded(self, estimator: AnyEstimator, settings: Any, drawn: Drawn) -> Record:
+        rows = slice(None) if hasattr(estimator, "network") else self.world(settings).rows
+        return recorded(estimator, drawn.measurements[:, rows], None if settings.bounds == "none" else drawn.box)
+
+    def _prepared(self, settings: Any, method: str, solver: str, drawn: Drawn) -> Prepared:
+        if settings.bounds == "none":
+            return self._shared(settings, method, solver)
+        return self._prepare(settings, method, solver, drawn.box)  # the box is the trial's own
+
     @lru_cache(maxsize=64)
-    def _prepared(self, settings: NetworkSettings, method: str, solver: str) -> Prepared:
+    def _shared(self, settings: NetworkSettings, method: str, solver: str) -> Prepared:
         # trials of a campaign differ in data only, so they share everything compiled
         return self._prepare(settings, method, solver, None)
 
-    def _prepare(self, settings: Any, method: str, solver: str, drawn: Drawn | None) -> Prepared:
+    def _prepare(self, settings: Any, method: str, solver: str, box: Polyhedron | None) -> Prepared:
         world = self.world(settings)
         started = time.perf_counter()
-        box = None if drawn is None else drawn.box
-        gains = self.gains(settings, world) if method in METHODS and method.endswith("_pre") else Gains(None, None)
-        weights = self.weights(settings, world, method)
-        estimator = make_estimator(world, settings, method, solver, gains, weights, box)
-        options = _options(estimator)
-        return Prepared(estimator, time.perf_counter() - started, options)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            gains = self.gains(settings, world) if method in METHODS and method.endswith("_pre") else Gains(None, None)
+            weights = self.weights(settings, world, method)
+            estimator = make_estimator(world, settings, method, solver, gains, weights, box)
+            options = _options(estimator)
+        seconds = time.perf_counter() - started
+        distinct = {(item.category, str(item.message)): item.message for item in caught}
+        warned = [item if isinstance(item, Warning) else UserWarning(item) for item in distinct.values()]
+        return Prepared(estimator, seconds, options, tuple(warned))
 
     def plot(self, settings: Any, drawn: Drawn, outcomes: Mapping[str, Outcome]) -> Figure:
         """Error of every node over time; centralized methods in every panel."""
@@ -207,8 +235,10 @@ def _options(estimator: AnyEstimator) -> dict[str, Any]:
     if isinstance(estimator, MovingHorizonEstimator):
         gain = estimator.window.gain
         return dict(estimator.options) | ({} if gain is None else {"gain": gain.tolist()})
-    if not isinstance(estimator, DistributedEstimator):
+    if not isinstance(estimator, NetworkRun):
         return {}
+    if not isinstance(estimator, DistributedEstimator):
+        return estimator.options.as_dict()
     design = estimator.design
     options = design.options.as_dict() | {"phi": design.reach, "gamma": design.growth}
     if design.gains is not None:
@@ -224,13 +254,11 @@ def _options(estimator: AnyEstimator) -> dict[str, Any]:
 
 def plot_errors(labels: tuple[Any, ...], errors: Mapping[str, np.ndarray]) -> Figure:
     """One panel per node with the error norms (steps, nodes) of every method, logarithmic, by label."""
-    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     columns = int(np.ceil(np.sqrt(len(labels))))
     rows = -(-len(labels) // columns)
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    figure = Figure(figsize=(1.5 + 3.2 * columns, 1.2 + 2.4 * rows), layout="constrained")
+    figure = new_figure(figsize=(1.5 + 3.2 * columns, 1.2 + 2.4 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for node, axes in enumerate(panels.flat):
         if node >= len(labels):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -119,11 +119,13 @@ class Drawn:
         states: (duration + 1, 4).
         measurements: (duration + 1, p) of the sensors of all nodes.
         box: bounds that the truth keeps and touches, so that noisy estimates are held by them.
+        references: what `reference` of a scenario found, kept for the other solvers of the trial.
     """
 
     states: np.ndarray
     measurements: np.ndarray
     box: Polyhedron
+    references: dict[Any, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from mhe.observers import place_gain
 from mhe.polyhedron import Polyhedron
 from mhe.scenarios._network_runs import NetworkScenario
 from mhe.scenarios._network_world import X1, X3, A, Drawn, Gains, NetworkSettings, World, consensus_weights
+from problems.bench.scenario import DISTANCE
 from problems.models import simulate
 from problems.networks import Network
 
@@ -51,7 +52,7 @@ class FourStateRing(NetworkScenario):
 
     name = "four-state-ring"
     source = "spec dmhe-pre-estimation 6.1; rmse as (2.34), of a network the mean over its nodes"
-    metrics = ("rmse", "rmse_1", "rmse_2", "rmse_3", "rmse_4")
+    metrics = ("rmse", "rmse_1", "rmse_2", "rmse_3", "rmse_4", DISTANCE)
     settings = Settings
 
     def draw(self, settings: Settings, rng: np.random.Generator) -> Drawn:

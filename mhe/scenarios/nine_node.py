@@ -11,6 +11,7 @@ import pydantic
 from mhe.polyhedron import Polyhedron
 from mhe.scenarios._network_runs import NetworkScenario
 from mhe.scenarios._network_world import X1, X3, A, Drawn, Gains, NetworkSettings, World, consensus_weights
+from problems.bench.scenario import DISTANCE
 from problems.models import simulate
 from problems.networks import Network, draw_connected, erdos_renyi, observability_report
 
@@ -62,7 +63,7 @@ class NineNode(NetworkScenario):
         "spec dmhe-pre-estimation 6.2; sums of the mean error norm over the nodes: transient t = 1 to 9, steady from "
         "t = 10, total both"
     )
-    metrics = ("transient", "steady", "total")
+    metrics = ("transient", "steady", "total", DISTANCE)
     settings = Settings
 
     def draw(self, settings: Settings, rng: np.random.Generator) -> Drawn:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mhe.distributed import NetworkDesign, run_trials
+from mhe.polyhedron import Polyhedron
 from mhe.scenarios.four_state_ring import CENTRAL_GAIN, GAINS, scenario
 from problems import registry
 from problems.bench.measure import measure
@@ -36,7 +38,7 @@ def run(method: str, trial: int = 0, solver: str = "auto", **given: Any) -> Outc
 def test_it_is_registered_with_its_contract() -> None:
     assert registry.load("scenarios", "four-state-ring") is scenario
     assert scenario.methods == ("kf", "mhe", "mhe_pre", "dmhe_f", "dmhe_pre", "dmhe_w_pre")
-    assert scenario.metrics == ("rmse", "rmse_1", "rmse_2", "rmse_3", "rmse_4")
+    assert scenario.metrics == ("rmse", "rmse_1", "rmse_2", "rmse_3", "rmse_4", "distance_to_reference")
     asked = {"horizon", "weights", "bounds", "prior", "form", "tolerance", "warm", "pi_update", "growth_prior"}
     assert asked <= set(describe(scenario)["settings"])
     assert {"kf", "mhe", "mhe_pre", "dmhe_f", "dmhe_pre", "dmhe_w_pre"} <= set(registry.names("estimators"))
@@ -100,8 +102,37 @@ def test_every_local_solve_is_counted_and_timed() -> None:
         assert set(made.times) == {"compile", "setup", "update", "solve"}
         spent = made.times["update"] + made.times["solve"]
         assert spent == pytest.approx(made.step_seconds.sum(), rel=0.05)
-    central = run("mhe", solver="daqp")
-    assert central.residual is not None and central.residual < 1e-8
+    for method, solves in {"mhe": 20, "dmhe_f": 80, "dmhe_w_pre": 80}.items():
+        named = run(method, solver="daqp")
+        assert named.residual is not None and 0 < named.residual < 1e-8 and named.iterations == solves
+    assert run("kf").residual is None
+
+
+@pytest.mark.parametrize(("method", "nodes"), [("mhe", 1), ("dmhe_f", 4), ("dmhe_w_pre", 4)])
+def test_distance_to_the_reference_shrinks_with_the_tolerance(method: str, nodes: int) -> None:
+    found = []
+    for tolerance in (1e-2, 1e-9):
+        row, made = measure(Job(scenario.name, method, "osqp", complete(scenario, {"tolerance": tolerance}), 7, 0))
+        assert made is not None and made.estimate is not None and made.estimate.shape == (21, nodes, 4)
+        found.append(row.metrics["distance_to_reference"])
+    assert found[0] > 1e-5 and found[1] < 1e-8
+    assert scenario.reference(settings(), "kf", drawn()) is None
+
+
+def test_the_reference_is_the_optimum_within_the_bounds_of_the_trial() -> None:
+    trial, given = drawn(1, bounds="tight"), settings(bounds="tight", tolerance=1e-3)
+    tight = scenario.run(settings(bounds="tight"), "dmhe_f", "auto", trial)
+    reference = scenario.reference(given, "dmhe_f", trial)
+    assert reference is not None and tight.trace.active.any()
+    assert tight.estimate == pytest.approx(reference, abs=1e-9)
+    assert scenario.reference(given, "dmhe_f", trial) is reference
+
+
+@pytest.mark.parametrize(("method", "columns"), [("kf", 1), ("dmhe_f", 4)])
+def test_the_error_is_followed_through_the_trial(method: str, columns: int) -> None:
+    made = run(method)
+    assert made.trace.errors.shape == (21, columns) and set(made.curves) == {"error"}
+    assert np.array_equal(made.curves["error"].values, made.trace.errors.mean(axis=1))
 
 
 def test_rows_hold_options_and_gains_as_json() -> None:
@@ -180,6 +211,20 @@ def test_infeasible_steps_name_node_and_instant_and_soft_bounds_answer_them() ->
     soft = run("dmhe_pre", trial, bounds="soft")
     assert soft.options["infeasible"] == "soft" and np.isfinite(soft.trace.errors).all()
     assert soft.metrics["rmse"] != hard.metrics["rmse"]
+
+
+def test_estimates_recover_from_bounds_that_contradict_the_measurements() -> None:
+    """Steps 6 to 8 are infeasible and step 5 nearly so: 3e-3 of x1 there move x3 by 4."""
+    hard, trial = settings(bounds="tight"), scenario.draw(settings(bounds="tight"), trial_rng(1, scenario.name, 6))
+    with pytest.warns(ModelWarning, match="3 local problem"):
+        made = scenario.run(hard, "mhe_pre", "daqp", trial)
+    wider = replace(trial, box=Polyhedron.box(trial.box.lower - 3e-3, trial.box.upper + 3e-3), references={})
+    with pytest.warns(ModelWarning, match="3 local problem"):
+        relaxed = scenario.run(hard, "mhe_pre", "daqp", wider)
+    assert made.status == relaxed.status == {"solved": 17, "infeasible": 3}
+    assert made.trace.errors[5] > 7 and relaxed.trace.errors[5] < 1
+    assert (made.trace.errors[6:9] > 7).all()  # predictions from step 5
+    assert np.abs(made.trace.errors[10:] - relaxed.trace.errors[10:]).max() < 0.1
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -11,6 +11,8 @@ import pytest
 from mhe.distributed import NetworkDesign, run_trials
 from mhe.scenarios.nine_node import CLASSES, scenario
 from problems import registry
+from problems.bench.measure import measure
+from problems.bench.rows import Job
 from problems.bench.scenario import Outcome, trial_rng
 from problems.bench.settings import complete, validated
 from problems.errors import ModelWarning, SettingError
@@ -45,7 +47,7 @@ def classes(**given: Any) -> dict[Any, str]:
 def test_it_is_registered_with_its_contract() -> None:
     assert registry.load("scenarios", "nine-node") is scenario
     assert scenario.methods == ("kf", "mhe", "mhe_pre", "dmhe_f", "dmhe_pre", "dmhe_w_pre")
-    assert scenario.metrics == ("transient", "steady", "total")
+    assert scenario.metrics == ("transient", "steady", "total", "distance_to_reference")
     assert settings().horizon == 4 and settings().duration == 50
 
 
@@ -136,3 +138,11 @@ def test_picture_has_nine_panels() -> None:
     figure = scenario.plot(settings(duration=12), drawn(duration=12), made)
     assert [axes.get_title() for axes in figure.axes] == [f"node {k}" for k in range(1, 10)]
     assert all(len(axes.lines) == 2 for axes in figure.axes)
+
+
+def test_rows_say_what_the_estimator_warned_of_in_every_trial() -> None:
+    chosen = complete(scenario, {"graph": "cycle", "duration": 10})
+    rows = [measure(Job(scenario.name, "dmhe_f", "auto", chosen, 7, trial))[0] for trial in range(3)]
+    assert all(len(row.warnings) == len(set(row.warnings)) > 0 for row in rows)
+    assert rows[0].warnings == rows[1].warnings == rows[2].warnings
+    assert any("gamma = 1.056" in text for text in rows[2].warnings)
