@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -20,6 +21,7 @@ from mhe.distributed.pool import WindowPool
 from mhe.observers import ObserverGain, given_gain, stationary_gain
 from mhe.placement import Placement
 from mhe.polyhedron import Polyhedron
+from mhe.window import prefers_quadratic
 from problems.errors import DefinitionError, ModelWarning, SettingError, ShapeError
 from problems.models import LinearModel, Model
 from problems.networks import (
@@ -124,6 +126,9 @@ class NetworkDesign:
         self.cap = CAP_FACTOR * float(np.trace(model.prior()[1]))
         checks.check_reach(self.reach)
         checks.check_growth(self.growth, self.cap)
+        if self.growth >= 1 and self.gains is None and options.form is None and prefers_quadratic(options.solver):
+            # F2 loses the digits of arrival costs that weigh next to nothing beside the disturbances
+            self.options = replace(options, form="F3")
         self._covariances: tuple[int, NetworkCovariances] | None = None
 
     def _weights(self, matrix: Any) -> Weights:

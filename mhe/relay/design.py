@@ -9,6 +9,7 @@ Source: dmhe-l-step, Algorithms (off-line), Assumptions and conditions.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
@@ -23,6 +24,7 @@ from mhe.relay.options import RelayOptions, relay_options_of
 from mhe.relay.prior import prior_information
 from mhe.relay.report import RelayReport, relay_report
 from mhe.relay.schedule import RelaySchedule, relay_schedule
+from mhe.window import prefers_quadratic
 from problems.errors import DefinitionError, SettingError, ShapeError, TopologyError
 from problems.models import LinearModel, Model
 from problems.networks import Network, Weights, given_weights, metropolis_weights, uniform_weights
@@ -119,7 +121,11 @@ class RelayDesign:
     ) -> None:
         if not isinstance(model, LinearModel):
             raise DefinitionError(f"distributed estimators need a LinearModel, got {model!r}")
-        self.options = relay_options_of(method, **overrides)
+        self.options = options = relay_options_of(method, **overrides)
+        estimated = options.disturbance == "process_noise"
+        if estimated and options.form is None and prefers_quadratic(options.solver):
+            # F2 loses digits where arrival costs weigh next to nothing, as those of nodes far from all sensors do
+            self.options = replace(options, form="F3")
         self.model, self.network = model, network
         self.state_bounds = state_bounds
         self.residual_bounds = residual_bounds_of(model, residual_bounds)

@@ -134,7 +134,7 @@ class RelayNetwork(StackedNetwork):
         y[: self._newest + 1][~design.held(node, self._newest)] = np.nan
         data = {**data, "y": y.reshape(-1, 1), "gain": plan.gain_at(self._newest)}
         if not y.size:
-            data.pop("y"), data.pop("gain")
+            del data["y"], data["gain"]
         if design.options.disturbance != "observer":
             data.pop("gain", None)
         found = relaxation(data, self._newest)

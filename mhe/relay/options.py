@@ -110,8 +110,7 @@ class RelayOptions(MethodOptions):
 RELAY_METHODS: dict[str, RelayOptions] = {
     "dmhe_l_pre": RelayOptions(),
     "dmhe_1_pre": RelayOptions(l=1),
-    # F2 loses digits where arrival costs weigh next to nothing, as those of nodes far from all sensors do
-    "dmhe_b": RelayOptions(disturbance="process_noise", l=1, form="F3"),
+    "dmhe_b": RelayOptions(disturbance="process_noise", l=1),
 }
 
 

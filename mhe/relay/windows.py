@@ -9,24 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from mhe.compiled import CompiledOnce, content
 from mhe.distributed.fallback import SOLVED
-from mhe.polyhedron import Polyhedron
 from mhe.relay.plan import RelayPlan
 from mhe.window import Window
 from problems.solvers.session import Session
 
 
-class RelayWindows:
-    """Sessions of windows by the content of their problem.
-
-    What it returns is compiled and never solved; take a fork or a batch of it.
-    """
-
-    def __init__(self) -> None:
-        self._compiled: dict[tuple[Any, ...], tuple[Window, Session]] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_compiled": {}}  # compiled code does not travel between processes
+class RelayWindows(CompiledOnce[tuple[Window, Session]]):
+    """Sessions of windows by the content of their problem."""
 
     def get(self, plan: RelayPlan, *, soft: bool = False) -> tuple[Window, Session]:
         """The window of a node and its session.
@@ -41,16 +32,11 @@ class RelayWindows:
         model, options = plan.model, plan.options
         settings = {"tolerance": options.tolerance, **options.settings}
         penalty = options.penalty if soft else None
-        sizes = [model.rows(sensor.name).stop for sensor in model.sensors]
         bounds = [plan.residual_bounds.get(sensor.name) for sensor in model.sensors]
-        key = (
-            *(matrix.tobytes() for matrix in (model.A, model.B, model.G, model.Q, model.C, model.R)),
-            (tuple(sizes), *(_content(bound) for bound in (plan.state_bounds, *bounds))),
-            (options.disturbance, options.horizon, options.form, penalty, options.solver),
-            repr(sorted(settings.items())),
-        )
-        found = self._compiled.get(key)
-        if found is None:
+        key = content(model), tuple(content(bound) for bound in (plan.state_bounds, *bounds))
+        chosen = options.disturbance, options.horizon, options.form, penalty, options.solver
+
+        def make() -> tuple[Window, Session]:
             window = Window(
                 model,
                 options.horizon,
@@ -60,8 +46,9 @@ class RelayWindows:
                 residual_bounds=plan.residual_bounds,
                 penalty=penalty,
             )
-            found = self._compiled[key] = window, window.compile(options.solver, **settings)
-        return found
+            return window, window.compile(options.solver, **settings)
+
+        return self._once((*key, *chosen, content(settings)), make)
 
 
 class Relaxation:
@@ -85,7 +72,3 @@ class Relaxation:
         if solution.status not in SOLVED:
             return None
         return solution["x"], self._window.unmet(solution, newest + 1)
-
-
-def _content(bounds: Polyhedron | None) -> tuple[bytes, ...] | None:
-    return None if bounds is None else tuple(part.tobytes() for part in (bounds.matrix, bounds.lower, bounds.upper))

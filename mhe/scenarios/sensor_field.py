@@ -24,7 +24,6 @@ from mhe.scenarios._network_runs import recorded, warn_of_infeasible
 from mhe.scenarios._network_world import World, registered_estimator
 from mhe.scenarios._sensor_field_settings import Settings
 from mhe.scenarios.sensor_field_world import FieldTrial, SensorField, draw_trial, sensor_field
-from mhe.window import prefers_quadratic
 from problems.bench.scenario import Curve, Outcome
 from problems.solvers.base import Status
 
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CENTRALIZED = ("kf", "mhe")
-ESTIMATES_DISTURBANCES = ("dmhe_f", "dmhe_b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,9 +204,6 @@ class SensorFieldScenario:
             "solver": solver,
             "tolerance": settings.tolerance,
         }
-        if method in ESTIMATES_DISTURBANCES and prefers_quadratic(solver):
-            # arrival costs far from sensors weigh next to nothing (errata 7, 10) and keep their digits only here
-            common["form"] = "F3"
         if method not in RELAY_METHODS:
             return common
         names = ("latency", "startup", "omega", "alpha", "arrival_divisor", "S", "gains")

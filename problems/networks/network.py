@@ -380,8 +380,8 @@ class Network:
         if link is not None:
             sender, receiver = self.names([link[0]]), self.names([link[1]])
             raise TopologyError(
-                f"{purpose}: the graph must be undirected, but node {sender} sends to node {receiver} without hearing it; "
-                "add the opposite links or use uniform weights"
+                f"{purpose}: the graph must be undirected, but node {sender} sends to node {receiver} without hearing "
+                "it; add the opposite links or use uniform weights"
             )
 
     def require_balanced(self, purpose: str) -> None:

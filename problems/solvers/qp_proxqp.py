@@ -17,8 +17,8 @@ _STATUS = {
     "PROXQP_SOLVED_CLOSEST_PRIMAL_FEASIBLE": Status.INFEASIBLE,
     "PROXQP_DUAL_INFEASIBLE": Status.UNBOUNDED,
 }
-# A solvable problem takes a few dozen. The library has no time limit, and its own 10 000 outer and 1 500 inner iterations
-# take minutes on infeasible windows of four unknowns.
+# A solvable problem takes a few dozen. The library has no time limit, and its own limits, 10 000 outer and 1 500 inner
+# iterations, take minutes on infeasible windows of four unknowns.
 _ITERATIONS, _INNER_ITERATIONS = 250, 50
 # Measured: the dense implementation is the faster one up to windows of some 80 unknowns, or if P and A are filled.
 _DENSE_SIZE = 10_000

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
-from problems.errors import DataError, FormError
+from problems.errors import DataError, FormError, UnknownNameError
 from problems.forms.layout import DataStore, Layout
 from problems.problem import Slot
 from problems.solvers.base import Options, Status
@@ -111,12 +111,23 @@ class Solution:
             self._active_set = self._check.active_set()
         return self._active_set
 
-    def covariance(self, *slots: Variable | Slot) -> np.ndarray:
+    def covariance(self, *slots: Variable | Slot | str) -> np.ndarray:
         """Joint covariance of the slots at the solution, in tangent coordinates (body frame), slot after slot.
 
-        Inequalities do not count. Raises UnobservableError where the costs leave a direction free.
+        Inequalities do not count.
+
+        Args:
+            slots: variables, indexed variables, or names of variables.
+
+        Raises:
+            UnobservableError: the costs leave a direction free.
+            UnknownNameError: no variable has that name.
         """
-        return self._check.covariance(slots)
+        unknowns = self._layout.problem.unknowns
+        for name in slots:
+            if isinstance(name, str) and name not in unknowns:
+                raise UnknownNameError("variable", name, unknowns)
+        return self._check.covariance(tuple(unknowns[one] if isinstance(one, str) else one for one in slots))
 
     def __repr__(self) -> str:
         lines = [
