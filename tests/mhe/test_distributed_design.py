@@ -250,3 +250,11 @@ def test_equal_local_problems_are_compiled_once() -> None:
     assert pool.get(again.regional[2], None, options_of("dmhe_f", horizon=3), None, None)[0] is not windows[2]
     box = Polyhedron.box([-1.0] * 4, [1.0] * 4)
     assert pool.get(again.regional[2], None, again.options, box, None)[0] is not windows[2]
+
+
+def test_growing_covariances_choose_the_form_that_keeps_their_digits() -> None:
+    net = Network.from_edges(CYCLE, range(1, 10), undirected=True)
+    assert quiet(nine_states(), net, horizon=4).options.form == "F3"
+    assert quiet(nine_states(), net, horizon=4, form="F2").options.form == "F2"
+    assert quiet(nine_states(), net, horizon=4, solver="ipopt").options.form is None
+    assert quiet(nine_states(), net, "dmhe_pre", horizon=4).options.form is None

@@ -11,7 +11,7 @@ import scipy.optimize
 
 import problems.solvers.qp_session as qp_session
 from problems import SE2, Cauchy, Gaussian, Huber, Problem, Vector, registry, wrap
-from problems.errors import DataError, FormError, MissingExtraError, UnobservableError
+from problems.errors import DataError, FormError, MissingExtraError, UnknownNameError, UnobservableError
 from problems.solvers.base import Status
 from problems.solvers.qp_support import Backend
 
@@ -731,3 +731,15 @@ def test_reset_sessions_answer_to_the_bit_whatever_weights_they_knew() -> None:
         assert all(np.array_equal(one, other) for one, other in zip(first, repeated, strict=True))
     sessions[1].update(R=0.9)
     np.testing.assert_allclose(sessions[1].solve({"y": outputs(4)})["x"], first[4], atol=1e-12)
+
+
+def test_covariances_by_name() -> None:
+    problem = Problem("two")
+    x, y = problem.variables("x", Vector(1)), problem.variables("y", Vector(1))
+    problem.cost("x", lambda x: x, on=x, noise=Gaussian(sigma=2.0))
+    problem.cost("step", lambda x, y: y - x, on=(x, y), noise=Gaussian(sigma=1.0))
+    solution = problem.compile().solve()
+    np.testing.assert_allclose(solution.covariance("x", "y"), [[4.0, 4.0], [4.0, 5.0]])
+    np.testing.assert_allclose(solution.covariance("y"), solution.covariance(y))
+    with pytest.raises(UnknownNameError, match="unknown variable 'z'"):
+        solution.covariance("z")
