@@ -321,11 +321,13 @@ class MovingHorizonEstimator:
     def _guess(self) -> np.ndarray:
         """The window before, moved on by the model without disturbance."""
         slots, before = self._slots, self._before
-        guess = np.vstack([before[1:], before[-1:]]) if slots.slid else before.copy()
+        guess = before.copy()
+        if slots.slid:
+            guess[:-1] = before[1:]
         for k in range(max(slots.newest, 1), len(guess)):
             moved = self.model.step(guess[k - 1], slots.inputs[k], self._now.parameters)
             # a prediction that leaves the model's domain is no start; standing still is
-            guess[k] = moved if np.isfinite(moved).all() else guess[k - 1]
+            guess[k] = moved if moved.dot(moved) < np.inf else guess[k - 1]
         return guess
 
 

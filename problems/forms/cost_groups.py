@@ -7,7 +7,7 @@ whole problem as one function saves the loop's copies but takes its time to comp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Protocol
 
@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dpotrf  # type: ignore[attr-defined]
 
 from problems.forms.kernels import CostKernel, cost_kernel
 from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, constant_whitening, noise_numbers
+from problems.forms.residual_code import buffered
 from problems.forms.sparsity import HessianPattern
 from problems.forms.template import template_of
 from problems.noise import whitening
@@ -70,7 +71,7 @@ class Cost:
         self.entry, self.term, self.count = entry, term, term.count
         self.template = template_of(term)
         self._full = term.noise.kind != "sigma" and self.template.dim > 1
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._last: tuple[bytes, np.ndarray] | None = None
         self.fixed_whitening: np.ndarray | None = None
         if not isinstance(term.noise.value, DataSlot):
             self.fixed_whitening = self._whitening(DataStore(layout))
@@ -87,10 +88,10 @@ class Cost:
             return self.fixed_whitening
         assert self.term.noise is not None
         value = self.term.noise.value
-        given = store[value.source.name]
+        given = store[value.source.name].tobytes()
         last = self._last
-        if last is None or not np.array_equal(last[0], given):
-            self._last = last = given.copy(), self._whitening(store)
+        if last is None or last[0] != given:
+            self._last = last = given, self._whitening(store)
         return last[1]
 
     def _whitening(self, store: DataStore) -> np.ndarray:
@@ -261,9 +262,9 @@ class MappedCosts:
         for kernel, cost, outputs in zip(kernels, costs, self._outputs, strict=True):
             inputs = self.flat[read : read + cost.count * kernel.code.inputs]
             results = self.out[write : write + cost.count * outputs]
-            self.linearizations.append(_buffered(kernel.code.function.map(cost.count), [inputs], results))
+            self.linearizations.append(buffered(kernel.code.function.map(cost.count), [inputs], results))
             values = self.one[single : single + cost.count]
-            self.evaluations.append(_buffered(kernel.value_code.function.map(cost.count), [inputs], values))
+            self.evaluations.append(buffered(kernel.value_code.function.map(cost.count), [inputs], values))
             read, write, single = read + inputs.size, write + results.size, single + cost.count
         self.rows, self.take = scatter(costs, parts, pattern)
 
@@ -344,8 +345,8 @@ class WholeCosts:
         sums = ca.densify(ca.mtimes(ca.DM(collect), ca.vertcat(*outputs))) if outputs else ca.SX.zeros(shape[0])
         self._x, self._p = np.zeros(x.shape[0]), np.zeros(max(p.shape[0], 1))
         self._value, self._sums = np.zeros(1), np.zeros(shape[0])
-        self._evaluate = _buffered(ca.Function("value", [x, p], [value]), [self._x, self._p], self._value)
-        self._linearize = _buffered(ca.Function("sums", [x, p], [sums]), [self._x, self._p], self._sums)
+        self._evaluate = buffered(ca.Function("value", [x, p], [value]), [self._x, self._p], self._value)
+        self._linearize = buffered(ca.Function("sums", [x, p], [sums]), [self._x, self._p], self._sums)
 
     def bind(self, store: DataStore, numbers: np.ndarray, flags: Flags) -> _BoundWhole:
         parameters = np.ones(self._p.size)
@@ -405,20 +406,6 @@ def scatter(
     if not again:
         return np.concatenate(rows), None
     return np.concatenate([*rows, *again_rows]), np.concatenate([np.arange(start), *again])
-
-
-def _buffered(function: ca.Function, inputs: Sequence[np.ndarray], result: np.ndarray) -> Callable[[], None]:
-    """A call without arguments: the function reads `inputs` and writes `result` in place."""
-    buffer, run = function.buffer()
-    access: Any = buffer  # its stubs know only calls with a size
-    for k, values in enumerate(inputs):
-        access.set_arg(k, values.data)
-    access.set_res(0, result.data)
-
-    def call(_alive: Any = (buffer, function, inputs, result)) -> None:  # the buffer knows them by address only
-        run()
-
-    return call
 
 
 def _repeated(slots: Sequence[Slot] | Sequence[DataSlot], sizes: Sequence[int], count: int) -> np.ndarray:

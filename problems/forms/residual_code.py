@@ -2,6 +2,7 @@
 
 One Python function is generated per template. It walks over chunks of instances that fit the cache and keeps all
 intermediate values in reused buffers, so the cost per instance is a few array passes and no Python (design section 7).
+Few instances go through CasADi's own loop instead, where a NumPy call per instruction would cost more.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from problems.forms.template import Template, template_of
 from problems.problem import Term
 
 CHUNK = 2048
+LOOP_COUNT = 200  # instances up to which CasADi's own loop over them is faster (measured)
+LOOPS = 16  # counts of instances for which such loops are kept
 
 _BINARY = {
     ca.OP_ADD: "np.add",
@@ -87,8 +90,11 @@ class ArrayCode:
         self.inputs, self.outputs = inputs.shape[0], outputs.shape[0]
         self.function = ca.Function("code", [inputs], [ca.cse(outputs)])
         self._variants: dict[tuple[bool, ...], Callable[..., None]] = {}
+        self._loops: dict[int, list[_Loop]] = {}
 
     def __call__(self, values: Sequence[Any], count: int, out: np.ndarray | None = None) -> np.ndarray:
+        if count <= LOOP_COUNT:
+            return self._looped(values, count, out)
         arrays = tuple(isinstance(v, np.ndarray) and v.ndim == 1 for v in values)
         code = self._variants.get(arrays)
         if code is None:
@@ -98,6 +104,48 @@ class ArrayCode:
         with np.errstate(all="ignore"):
             code(values, out, count)
         return out
+
+    def _looped(self, values: Sequence[Any], count: int, out: np.ndarray | None) -> np.ndarray:
+        # taken out while in use, so that threads that call at once make their own
+        spare = self._loops.get(count)
+        if spare is None:
+            if len(self._loops) >= LOOPS:
+                self._loops.clear()
+            spare = self._loops[count] = []
+        loop = spare.pop() if spare else _Loop(self.function, count)
+        given = loop.given
+        for k, value in enumerate(values):
+            given[:, k] = value
+        loop.run()
+        if out is None:
+            out = loop.found.T.copy()
+        else:
+            out[:] = loop.found.T
+        if not spare:
+            spare.append(loop)
+        return out
+
+
+class _Loop:
+    """CasADi's loop over `count` instances and its buffers."""
+
+    def __init__(self, function: ca.Function, count: int) -> None:
+        self.given, self.found = (np.empty((count, n)) for n in (function.size1_in(0), function.size1_out(0)))
+        self.run = buffered(function.map(count), [self.given], self.found)
+
+
+def buffered(function: ca.Function, inputs: Sequence[np.ndarray], result: np.ndarray) -> Callable[[], None]:
+    """A call without arguments: the function reads `inputs` and writes `result` in place."""
+    buffer, run = function.buffer()
+    access: Any = buffer  # its stubs know only calls with a size
+    for k, values in enumerate(inputs):
+        access.set_arg(k, values.data)
+    access.set_res(0, result.data)
+
+    def call(_alive: Any = (buffer, function, inputs, result)) -> None:  # the buffer knows them by address only
+        run()
+
+    return call
 
 
 def _generate(function: ca.Function, arrays: tuple[bool, ...]) -> Callable[..., None]:

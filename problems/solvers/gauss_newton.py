@@ -256,7 +256,8 @@ class _Search:
         """One accepted step, or the reason to stop."""
         session = self.session
         free = session.settings.screen and not session.constraints.size
-        gradient[session.pins.columns] = 0.0
+        if session.pins.columns.size:
+            gradient[session.pins.columns] = 0.0
         violation, largest = self._violation(self.point)
         kept = None
         if session.sparse and not forced:
