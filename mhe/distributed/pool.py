@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from mhe.compiled import CompiledOnce, content
 from mhe.distributed.options import DistributedOptions
 from mhe.polyhedron import Polyhedron
 from mhe.window import Window
@@ -13,17 +12,8 @@ from problems.models import LinearModel
 from problems.solvers.session import Session
 
 
-class WindowPool:
-    """Sessions of windows by the content of their problem: nodes, and networks, with equal problems share them.
-
-    What it returns is compiled and never solved; take a fork or a batch of it.
-    """
-
-    def __init__(self) -> None:
-        self._compiled: dict[tuple[Any, ...], tuple[Window, Session]] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_compiled": {}}  # compiled code does not travel between processes
+class WindowPool(CompiledOnce[tuple[Window, Session]]):
+    """Sessions of windows by the content of their problem: nodes, and networks, with equal problems share them."""
 
     def get(
         self,
@@ -48,16 +38,10 @@ class WindowPool:
         """
         penalty = options.penalty if soft else None
         settings = {"tolerance": options.tolerance, **options.settings}
-        key = (
-            *(matrix.tobytes() for matrix in (model.A, model.B, model.G, model.Q, model.C, model.R)),
-            tuple(model.rows(sensor.name).stop for sensor in model.sensors),
-            None if gain is None else gain.tobytes(),
-            _content(state_bounds),
-            _content(disturbance_bounds),
-            (options.horizon, options.form, penalty, options.solver, repr(sorted(settings.items()))),
-        )
-        found = self._compiled.get(key)
-        if found is None:
+        bounds = content(state_bounds), content(disturbance_bounds)
+        key = content(model), content(gain), bounds, options.horizon, options.form, penalty, options.solver
+
+        def make() -> tuple[Window, Session]:
             window = Window(
                 model,
                 options.horizon,
@@ -67,9 +51,6 @@ class WindowPool:
                 disturbance_bounds=disturbance_bounds,
                 penalty=penalty,
             )
-            found = self._compiled[key] = window, window.compile(options.solver, **settings)
-        return found
+            return window, window.compile(options.solver, **settings)
 
-
-def _content(bounds: Polyhedron | None) -> tuple[bytes, ...] | None:
-    return None if bounds is None else tuple(part.tobytes() for part in (bounds.matrix, bounds.lower, bounds.upper))
+        return self._once((*key, content(settings)), make)

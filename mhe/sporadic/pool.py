@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from mhe.compiled import CompiledOnce, content
 from mhe.sporadic.options import SporadicOptions
 from mhe.sporadic.window import DetectionWindow, WindowShape
 from problems.solvers.session import Session
 
 
-class DetectionPool:
-    """Sessions of windows by their content. What it returns is compiled and never solved; take a fork of it."""
-
-    def __init__(self) -> None:
-        self._compiled: dict[tuple[Any, ...], Session] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_compiled": {}}  # compiled code does not travel between processes
+class DetectionPool(CompiledOnce[Session]):
+    """Sessions of windows by their content."""
 
     def get(
         self,
@@ -43,10 +36,7 @@ class DetectionPool:
         given = (noise_gain, noise) if shape.disturbances else (None, None)
         penalty = options.penalty if soft else None
         settings = {"tolerance": options.tolerance, **options.settings}
-        content = tuple(None if part is None else part.tobytes() for part in given)
-        key = (shape, content, penalty, options.solver, repr(sorted(settings.items())))
-        found = self._compiled.get(key)
-        if found is None:
-            window = DetectionWindow(shape, *given, penalty=penalty)
-            found = self._compiled[key] = window.compile(options.solver, **settings)
-        return found
+        key = shape, *(content(part) for part in given), penalty, options.solver, content(settings)
+        return self._once(
+            key, lambda: DetectionWindow(shape, *given, penalty=penalty).compile(options.solver, **settings)
+        )
