@@ -23,7 +23,7 @@ from problems.forms.sparsity import HessianPattern
 from problems.solvers.base import Options, Status
 from problems.solvers.factorizations import Factorization, SingularError, factorization
 
-GROWTH = 1e2  # of a general direction by one inverse iteration, below which none is free, even by a damped factorization
+GROWTH = 1e2  # of a general direction by an inverse iteration, below which none is free, nor by a damped matrix
 LOOSE = 1e-13  # curvature along a direction, in the scale of the diagonal, that is none
 RIDGE = 1e-12  # of the largest diagonal entry, added so that directions the costs leave free have finite steps
 
