@@ -100,7 +100,7 @@ Step = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 def opti_step(model: NonlinearModel, solver: str) -> Step:
     """The window in Opti: prior, measurements (N + 1, 4), inputs (N + 1, 2), start (N + 1, 3) to states (N + 1, 3)."""
-    W, V, Pi = (ca.DM(np.linalg.inv(matrix)) for matrix in (model.Q, model.R, model.covariance))
+    W, V, Pi = (ca.DM(np.linalg.inv(matrix)) for matrix in (model.Q, model.R, model.prior()[1]))
     window = ca.Opti()
     x, w = [window.variable(3)], []
     for _ in range(N):  # in the order of stages, which fatrop wants
@@ -135,7 +135,7 @@ def opti_step(model: NonlinearModel, solver: str) -> Step:
 
 def expanded_step(model: NonlinearModel, solver: str) -> Step:
     """The same as one expanded NLP with everything in one call, the fastest way CasADi has."""
-    W, V, Pi = (ca.DM(np.linalg.inv(matrix)) for matrix in (model.Q, model.R, model.covariance))
+    W, V, Pi = (ca.DM(np.linalg.inv(matrix)) for matrix in (model.Q, model.R, model.prior()[1]))
     x, w = [ca.SX.sym(f"x{k}", 3) for k in range(N + 1)], [ca.SX.sym(f"w{k}", 3) for k in range(N)]
     prior, y, u = ca.SX.sym("prior", 3), ca.SX.sym("y", 4, N + 1), ca.SX.sym("u", 2, N + 1)
     cost: Any = ca.bilin(Pi, x[0] - prior, x[0] - prior)
@@ -199,7 +199,7 @@ def do_mpc_step(
     stage = w.cat.T @ W @ w.cat + v.cat.T @ V @ v.cat
     ahead = estimator._x["x"] - estimator._x_prev["x"]
     missed = estimator._p_set["first"] - ranges(estimator._x["x"])
-    estimator.set_objective(stage, ahead.T @ ca.DM(np.linalg.inv(model.covariance)) @ ahead + missed.T @ V @ missed)
+    estimator.set_objective(stage, ahead.T @ ca.DM(np.linalg.inv(model.prior()[1])) @ ahead + missed.T @ V @ missed)
     now = [0]
     y_template, p_template, tvp_template = (
         estimator.get_y_template(),
