@@ -119,6 +119,8 @@ def track_wheels(
         raise DataError(
             f"{recording.name}: needs wheel odometry and anchors in the plane; use `track` without odometry"
         )
+    if batch and solver in ("auto", "gauss-newton"):  # a handful of robust ranges bends the first windows strongly
+        solver_settings = {"iteration_limit": 500} | solver_settings
     T, first = recording.time, start_pose(recording) if start is None else start
     smoother = _smoother(s, first, len(T) if batch else s.lag, None if batch else s.iterations, solver, solver_settings)
     moves, sigma = _moves(recording, s)
