@@ -12,6 +12,7 @@ import numpy as np
 import pydantic
 
 from problems import registry
+from problems.display import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +50,7 @@ class Consistency:
     degrees: int
 
 
-@dataclass
+@dataclass(repr=False)
 class Outcome:
     """What one method did in one trial.
 
@@ -79,6 +80,22 @@ class Outcome:
     consistency: Mapping[str, Consistency] = field(default_factory=dict)
     estimate: np.ndarray | None = None
     trace: Any = None
+
+    def table(self) -> Table:
+        """Metrics, statuses and times."""
+        rows: list[tuple[str, Any]] = list(self.metrics.items())
+        rows += [(f"steps {name}", count) for name, count in self.status.items() if count]
+        if self.step_seconds.size:
+            rows.append(("median step (s)", float(np.median(self.step_seconds))))
+        rows += [(f"{name} (s)", seconds) for name, seconds in self.times.items()]
+        rows += [] if self.residual is None else [("worst residual", self.residual)]
+        return Table("Outcome of one trial", ("what", "value"), rows)
+
+    def __repr__(self) -> str:
+        return str(self.table())
+
+    def _repr_html_(self) -> str:
+        return self.table()._repr_html_()
 
 
 TIMES = ("compile", "setup", "update", "solve")

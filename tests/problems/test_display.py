@@ -11,6 +11,7 @@ import pytest
 from localization import measurements as meas
 from mhe import mhe
 from problems import SE2, Gaussian, Huber, LinearModel, Problem, Sensor, Vector
+from problems.bench.scenario import Outcome
 from problems.display import LONGEST, Table
 from problems.errors import DefinitionError
 from problems.forms.factor_graph import FactorGraph
@@ -114,3 +115,12 @@ def test_structure(count: int) -> None:
 def test_nothing_to_draw() -> None:
     with pytest.raises(DefinitionError, match="nothing to draw"):
         Problem("empty").plot_structure()
+
+
+def test_outcome() -> None:
+    outcome = Outcome({"rmse": 0.25, "never": None}, times={"solve": 0.5}, step_seconds=np.array([1.0, 3.0, 2.0]))
+    outcome.status.update(solved=3, failed=0)
+    cells = _Cells(outcome._repr_html_()).texts
+    assert cells[cells.index("rmse") + 1] == "0.25" and cells[cells.index("steps solved") + 1] == "3"
+    assert "steps failed" not in cells and cells[cells.index("median step (s)") + 1] == "2"
+    assert repr(outcome).splitlines()[0] == "Outcome of one trial"
