@@ -26,7 +26,23 @@ TRACKER = (
 )  # fmt: skip
 
 
-class WheelMethods:
+class _OneTag:
+    """What all methods of a recording with one tag have in common."""
+
+    @staticmethod
+    def plot(recording: UwbRecording, traces: dict[str, Any]) -> Figure:
+        from localization.plots import plot_tracks
+
+        return plot_tracks(recording, traces)
+
+    @staticmethod
+    def tracks(recording: UwbRecording, poses: Poses) -> np.ndarray:
+        """One trajectory."""
+        del recording
+        return np.full(len(poses), "tag")
+
+
+class WheelMethods(_OneTag):
     """A tag on a robot with wheel odometry and anchors in the plane (labyrinth folders); see `wheeled_tracker`."""
 
     what = "a UWB recording with wheel odometry"
@@ -79,18 +95,6 @@ class WheelMethods:
         )
 
     @staticmethod
-    def plot(recording: UwbRecording, traces: dict[str, Any]) -> Figure:
-        from localization.plots import plot_tracks
-
-        return plot_tracks(recording, traces)
-
-    @staticmethod
-    def tracks(recording: UwbRecording, poses: Poses) -> np.ndarray:
-        """One trajectory."""
-        del recording
-        return np.full(len(poses), "tag")
-
-    @staticmethod
     def poses(recording: UwbRecording, made: Any) -> Poses:
         """Poses with the recording's stamps."""
         count, value = len(made.estimate), made.estimate.value
@@ -98,7 +102,7 @@ class WheelMethods:
         return Poses(stamps, np.full(count, "tag"), value[:, :2], value[:, 2:])
 
 
-class UwbMethods:
+class UwbMethods(_OneTag):
     """See the module."""
 
     what = "a UWB recording"
@@ -144,18 +148,6 @@ class UwbMethods:
             residual=made.residual,
             trace=made,
         )
-
-    @staticmethod
-    def plot(recording: UwbRecording, traces: dict[str, Track]) -> Figure:
-        from localization.plots import plot_tracks
-
-        return plot_tracks(recording, traces)
-
-    @staticmethod
-    def tracks(recording: UwbRecording, poses: Poses) -> np.ndarray:
-        """One trajectory."""
-        del recording
-        return np.full(len(poses), "tag")
 
     @staticmethod
     def poses(recording: UwbRecording, made: Track) -> Poses:

@@ -7,11 +7,9 @@ from typing import Any
 from mhe.distributed.design import NetworkDesign
 from mhe.distributed.node import DistributedNode
 from mhe.distributed.options import DistributedOptions
-from mhe.network import Infeasibility, MeasuringRun, NetworkEstimate, PlannedNodes
+from mhe.network import MeasuringRun, PlannedNodes
 from problems.models import Model
 from problems.networks import Network
-
-__all__ = ["DistributedEstimator", "Infeasibility", "NetworkEstimate"]
 
 
 class DistributedEstimator(MeasuringRun[NetworkDesign]):

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from mhe.distributed.fallback import SOLVED, STOPPED, predicted
-from mhe.distributed.network import Infeasibility
 from mhe.distributed.summed import Outputs, Region, SummedWindow, Sums
+from mhe.network import Infeasibility
 from problems.errors import DataError, ShapeError
 from problems.models import LinearModel
 from problems.networks import Network
