@@ -26,33 +26,32 @@ class HessianPattern:
 
     def __init__(self, layout: Layout, terms: Sequence[tuple[TermLayout, Sequence[tuple[int, int]]]]) -> None:
         blocks = layout.block_dims.size
-        dims, start = layout.block_dims, layout.block_columns
-        keys = [np.arange(blocks) * blocks + np.arange(blocks)]
-        for entry, _ in terms:
-            slots = entry.blocks.shape[1]
-            for a in range(slots):
-                for b in range(a + 1, slots):
-                    keys.append(_key(entry.blocks[:, a], entry.blocks[:, b], blocks))
-        every = np.concatenate(keys)
+        dims, start = layout.block_dims, layout.block_columns[:-1]
+        every = np.concatenate([np.arange(blocks) * (blocks + 1), *(_links(entry, blocks) for entry, _ in terms)])
         every.sort()
         fresh = np.ones(every.size, bool)
         np.not_equal(every[1:], every[:-1], out=fresh[1:])
         unique = every[fresh]
-        col, row = unique // blocks, unique % blocks  # sorted by column, then row; the diagonal block is last
+        col = unique // blocks  # sorted by column, then row; the diagonal block is last
+        row = unique - col * blocks
+        last = np.searchsorted(col, np.arange(blocks), side="right") - 1
+        first = np.concatenate([[0], last + 1])[:blocks]
         height = dims[row]
-        first = np.searchsorted(col, np.arange(blocks))
         before = np.cumsum(height) - height
         above = before - before[first][col]  # rows of the column above this block
-        off = np.zeros(blocks, np.intp)
-        np.add.at(off, col[row != col], height[row != col])
+        off = above[last]
         length = np.repeat(off, dims) + _ramp(dims) + 1
         self.size = int(dims.sum())
         self.indptr = np.concatenate([[0], np.cumsum(length)]).astype(np.intp)
         self.diagonal = self.indptr[1:] - 1
-        self._unique, self._above, self._start = unique, above, start
+        rows = _ramp(height) + np.repeat(start[row], height)
+        # the columns of one instance have the same rows, only that each ends at its own diagonal
+        shift = np.repeat(before[first], dims) - self.indptr[:-1]
+        self.indices = rows[np.arange(self.nonzeros) + np.repeat(shift, length)]
+        self._unique, self._start = unique, start
+        self._corners, self._last, self._off = self.indptr[start[col]] + above, last, off
         self._graph = (row, col, dims)
         self.blocks, self.pairs = blocks, int(unique.size) - blocks
-        self.indices = self._row_indices(col, row, dims)
         self.positions = [self._positions(entry, pairs) for entry, pairs in terms]
 
     @property
@@ -105,53 +104,55 @@ class HessianPattern:
             if (part := picked[dims[picked] == dim]).size
         ]
 
-    def _row_indices(self, col: np.ndarray, row: np.ndarray, dims: np.ndarray) -> np.ndarray:
-        indices = np.empty(self.nonzeros, np.intp)
-        for width in np.unique(dims):
-            for height in np.unique(dims):
-                pick = np.flatnonzero((dims[col] == width) & (dims[row] == height))
-                c, r, up = col[pick], row[pick], self._above[pick]
-                if not pick.size:
-                    continue
-                a, b = np.arange(height), np.arange(width)
-                at = (self.indptr[self._start[c][:, None] + b] + up[:, None])[:, :, None] + a
-                rows = np.broadcast_to(self._start[r][:, None, None] + a, at.shape)
-                use = (c != r)[:, None, None] | (a <= b[:, None])
-                indices[at[use]] = rows[use]
-        return indices
-
     def _positions(self, entry: TermLayout, pairs: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray | None]:
         """Positions (pairs, count) of the entries; those that count twice (one instance in two slots), if any."""
-        slot_dims = [int(s.source.space.dim) for s in entry.term.slots]
-        slot_of = np.repeat(np.arange(len(slot_dims)), slot_dims)
-        local = _ramp(np.array(slot_dims))
+        slot_dims = np.array([s.source.space.dim for s in entry.term.slots])
+        slot_of = np.repeat(np.arange(slot_dims.size), slot_dims)
+        local = _ramp(slot_dims)
         out = np.empty((len(pairs), entry.term.count), np.intp)
-        twice = np.full(out.shape, -1) if _repeats(entry) else None
+        twice = None
         groups: dict[tuple[int, int], list[int]] = {}
         for k, (p, q) in enumerate(pairs):
             groups.setdefault((slot_of[p], slot_of[q]), []).append(k)
         for (s, t), group in groups.items():
-            p, q = np.array([pairs[k] for k in group]).T[:, :, None]
-            bi, bj = entry.blocks[:, s], entry.blocks[:, t]
-            up = self._above[np.searchsorted(self._unique, _key(bi, bj, self.blocks))]
-            ci, cj = self._start[bi] + local[p], self._start[bj] + local[q]
-            at = self.indptr[cj] + local[p]
-            if s != t:
-                at = np.where(ci > cj, self.indptr[ci] + local[q], at)
-            out[group] = at + up
-            if twice is not None and s != t:
-                twice[group] = np.where(ci == cj, out[group], -1)
+            a, b = local[np.array([pairs[k] for k in group]).T]
+            i, j = entry.blocks[:, s], entry.blocks[:, t]
+            if s == t:
+                out[group] = _within(self._corners[self._last[i]], self._off[i], a, b)
+                continue
+            high = np.maximum(i, j)
+            corner = self._corners[np.searchsorted(self._unique, _key(i, j, self.blocks))]
+            found, off = _within(corner, self._off[high], a, b), self._off[high]
+            swap, same = np.flatnonzero(i > j), np.flatnonzero(i == j)
+            found[:, swap] = _within(corner[swap], off[swap], b, a)
+            if same.size:
+                found[:, same] = _within(corner[same], off[same], np.minimum(a, b), np.maximum(a, b))
+                twice = np.full(out.shape, -1) if twice is None else twice
+                twice[np.ix_(np.array(group)[a == b], same)] = found[np.ix_(a == b, same)]
+            out[group] = found
         return out, twice
 
 
-def _repeats(entry: TermLayout) -> bool:
-    """Whether one instance fills two slots of the term."""
-    blocks = np.sort(entry.blocks, axis=1)
-    return bool((blocks[:, 1:] == blocks[:, :-1]).any())
+def _links(entry: TermLayout, blocks: int) -> np.ndarray:
+    """Keys of all pairs of instances that the term joins."""
+    slots = entry.blocks.shape[1]
+    ends = [(entry.blocks[:, a], entry.blocks[:, b]) for a in range(slots) for b in range(a + 1, slots)]
+    return np.concatenate([np.zeros(0, np.intp), *(_key(a, b, blocks) for a, b in ends)])
 
 
 def _key(a: np.ndarray, b: np.ndarray, blocks: int) -> np.ndarray:
     return np.maximum(a, b) * blocks + np.minimum(a, b)
+
+
+def _within(corner: np.ndarray, off: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Positions (entries, blocks) of entries `row`, `column` of blocks that begin at `corner`.
+
+    The first column of the instance has `off` entries above its diagonal and each one after it has one more.
+    """
+    out = column[:, None] * off
+    out += corner
+    out += (column * (column + 1) // 2 + row)[:, None]
+    return out
 
 
 def _ramp(dims: np.ndarray) -> np.ndarray:
