@@ -67,7 +67,7 @@ def marginal_covariances(session: Session, solution: Solution, aligned: bool = F
     pins = Pins(layout)
     if Constraints(layout, pins.names).equalities:
         raise FormError(f"marginals of {session.problem.name!r}: it has equalities; use joint_covariance")
-    form = LeastSquares(session.problem, layout, whole=False)
+    form = LeastSquares(session.problem, layout)
     _, gradient, hessian = form.bind(session.store).linearize(solution.point)
     pattern = form.pattern
     pins.reduce(gradient, hessian, pattern)

@@ -112,7 +112,7 @@ def evaluate(problem: Problem, values: Mapping[str, Any]) -> tuple[float, float]
     from problems.forms.pins import Pins
 
     layout = Layout(problem)
-    bound = LeastSquares(problem, layout, whole=False).bind(DataStore(layout))
+    bound = LeastSquares(problem, layout).bind(DataStore(layout))
     cost, gradient, _ = bound.linearize(layout.point(values))
     gradient[Pins(layout).columns] = 0.0
     return cost, float(np.abs(gradient).max())

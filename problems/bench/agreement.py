@@ -84,7 +84,7 @@ def _constant(session: Session) -> float:
     """Cost of a quadratic program at zero for the data of the session; 0 for other problems."""
     if not is_affine(session.problem):
         return 0.0
-    bound = LeastSquares(session.problem, session.layout, whole=False).bind(session.store)
+    bound = LeastSquares(session.problem, session.layout).bind(session.store)
     return bound.cost(session.layout.identity())
 
 

@@ -302,7 +302,7 @@ def _require_same(graph: Any, values: Any, imported: Imported) -> None:
         if factor is not None and not factor.noiseModel().isConstrained():
             own.add(factor)
     layout = Layout(imported.problem)
-    bound = LeastSquares(imported.problem, layout, whole=False).bind(DataStore(layout))
+    bound = LeastSquares(imported.problem, layout).bind(DataStore(layout))
     ours, theirs = bound.cost(layout.point(imported.initial)), own.error(values)
     if not abs(ours - theirs) <= AGREE * max(1.0, abs(theirs)):
         raise FormError(

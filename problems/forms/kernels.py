@@ -12,7 +12,6 @@ from itertools import combinations_with_replacement
 
 import casadi as ca
 
-from problems.forms.residual_code import ArrayCode
 from problems.forms.template import Template
 from problems.noise import Loss
 
@@ -23,6 +22,7 @@ class CostKernel:
 
     Attributes:
         inputs: SX column: stored coordinates, data, whitening numbers, linear part.
+        stored: how many of them are coordinates.
         value: SX scalar, the cost of an instance.
         gradient: SX (width, 1) in tangent coordinates.
         hessian: SX column of the entries `pairs` of the Gauss-Newton Hessian.
@@ -30,25 +30,29 @@ class CostKernel:
     """
 
     inputs: ca.SX
+    stored: int
     value: ca.SX
     gradient: ca.SX
     hessian: ca.SX
     pairs: tuple[tuple[int, int], ...]
 
     @cached_property
-    def value_code(self) -> ArrayCode:
+    def value_function(self) -> ca.Function:
         """The cost alone."""
-        return ArrayCode(self.inputs, self.value)
+        return self._function(self.value)
 
     @cached_property
-    def gradient_code(self) -> ArrayCode:
+    def gradient_function(self) -> ca.Function:
         """Cost and gradient."""
-        return ArrayCode(self.inputs, ca.vertcat(self.value, self.gradient))
+        return self._function(self.value, self.gradient)
 
     @cached_property
-    def code(self) -> ArrayCode:
+    def function(self) -> ca.Function:
         """Cost, gradient and Hessian entries, one after the other."""
-        return ArrayCode(self.inputs, ca.vertcat(self.value, self.gradient, self.hessian))
+        return self._function(self.value, self.gradient, self.hessian)
+
+    def _function(self, *outputs: ca.SX) -> ca.Function:
+        return ca.Function("kernel", [self.inputs], [ca.cse(ca.densify(ca.vertcat(*outputs)))])
 
 
 @lru_cache(maxsize=1024)
@@ -85,7 +89,7 @@ def cost_kernel(template: Template, full: bool, linear: bool, loss: Loss, switch
     pairs = tuple((a, b) for a in range(width) for b in range(a, width) if H.has_nz(a, b))
     hessian = ca.vertcat(*(w * H[a, b] for a, b in pairs)) if pairs else ca.SX(0, 1)
     inputs = ca.vertcat(template.point, template.numbers, entries, lam, on)
-    return CostKernel(inputs, value, ca.densify(gradient), hessian, pairs)
+    return CostKernel(inputs, template.point.shape[0], value, ca.densify(gradient), hessian, pairs)
 
 
 def gate(on: ca.SX, value: ca.SX) -> ca.SX:

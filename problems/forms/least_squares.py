@@ -1,48 +1,31 @@
 """Value, gradient and Gauss-Newton Hessian of all costs of a problem, and residual rows of its constraints.
 
-Terms are evaluated by array code, by CasADi's loop over instances, or all at once (`problems.forms.cost_groups`).
+Costs are machine code (`problems.forms.costs`), constraints array code (`problems.forms.residual_code`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from problems.forms.cost_groups import ArrayCosts, Cost, CostGroup, Flags, Linearization, MappedCosts, WholeCosts
+from problems.forms.costs import Bound, Cost, CostCode, Flags
 from problems.forms.layout import Activity, DataStore, Layout, constant_rows
 from problems.forms.residual_code import residual_code
 from problems.forms.sparsity import HessianPattern
 from problems.forms.template import template_of
 from problems.problem import DataSlot, Problem
 
-WHOLE_WORK = 10_000  # instructions of all instances up to which one function of the whole problem pays its compilation
-LOOP_COUNT = 300  # instances of a term up to which CasADi's loop is faster than array code
 PATTERNS = 32  # of active instances that are remembered
 
 
 class LeastSquares:
-    """Costs and constraints of a problem, ready to be bound to data (`bind`).
+    """Costs of a problem, ready to be bound to data (`bind`)."""
 
-    Args:
-        whole: one compiled function of all costs (True), array code for every term (False), or the fastest by size.
-    """
-
-    def __init__(self, problem: Problem, layout: Layout, whole: bool | None = None) -> None:
+    def __init__(self, problem: Problem, layout: Layout) -> None:
         self.problem, self.layout = problem, layout
         self.activity = Activity(layout)
         self.costs = costs = [Cost(layout, entry) for entry in layout.terms if entry.term.kind == "cost"]
-        self.whole = _is_small(costs) if whole is None else whole
-        self.pattern = pattern = HessianPattern(layout, [(c.entry, c.kernel(self.whole).pairs) for c in costs])
-        self.groups: list[CostGroup] = []
-        if self.whole:
-            self.groups.append(WholeCosts(layout, costs, pattern))
-        else:
-            few = [k for k, cost in enumerate(costs) if whole is None and cost.count <= LOOP_COUNT]
-            many = [k for k in range(len(costs)) if k not in few]
-            for kind, chosen in ((MappedCosts, few), (ArrayCosts, many)):
-                if chosen:
-                    self.groups.append(kind(layout, [costs[k] for k in chosen], chosen, pattern))
+        self.pattern = HessianPattern(layout, [(c.entry, c.kernel.pairs) for c in costs])
+        self._code = CostCode(layout, costs, self.pattern)
         self._flags: dict[bytes, Flags] = {}
 
     def bind(self, store: DataStore) -> Bound:
@@ -60,50 +43,7 @@ class LeastSquares:
             self._flags[key] = flags
         if not finite:
             store.require_finite()
-        return Bound(self, store, flags, numbers.copy() if finite else np.where(np.isnan(numbers), 0.0, numbers))
-
-
-def _is_small(costs: Sequence[Cost]) -> bool:
-    if 10 * sum(cost.count for cost in costs) > WHOLE_WORK:
-        return False  # no kernel has fewer than ten instructions
-    return sum(cost.count * cost.kernel(switched=True).code.function.n_instructions() for cost in costs) <= WHOLE_WORK
-
-
-class Bound:
-    """Costs for fixed data.
-
-    Attributes:
-        numbers: the data, zeros where they are missing.
-        flags: which instances are on.
-    """
-
-    def __init__(self, form: LeastSquares, store: DataStore, flags: Flags, numbers: np.ndarray) -> None:
-        self.form, self.flags, self.numbers = form, flags, numbers
-        self._parts = [group.bind(store, numbers, flags) for group in form.groups]
-
-    def cost(self, point: np.ndarray) -> float:
-        return sum(part.cost(point) for part in self._parts)
-
-    def linearize(self, point: np.ndarray) -> Linearization:
-        """Cost, gradient (size,), Hessian entries in the order of the pattern, in new arrays."""
-        if not self._parts:
-            return 0.0, np.zeros(self.form.pattern.size), np.zeros(self.form.pattern.nonzeros)
-        total, gradient, hessian = self._parts[0].linearize(point)
-        for part in self._parts[1:]:
-            value, slope, curvature = part.linearize(point)
-            total += value
-            gradient += slope
-            hessian += curvature
-        return total, gradient, hessian
-
-    def gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
-        """Cost and gradient, in new arrays; on many instances in a third of the time of `linearize`."""
-        total, gradient = 0.0, np.zeros(self.form.pattern.size)
-        for part in self._parts:
-            value, slope = part.gradient(point)
-            total += value
-            gradient += slope
-        return total, gradient
+        return self._code.bind(store, numbers.copy() if finite else np.where(np.isnan(numbers), 0.0, numbers), flags)
 
 
 class Constraints:

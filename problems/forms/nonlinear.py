@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from problems.forms.cost_groups import Flags, whitening_numbers
+from problems.forms.costs import Flags, whitening_numbers
 from problems.forms.kernels import cost_kernel, gate
 from problems.forms.layout import Activity, DataStore, Layout, TermLayout, constant_rows
 from problems.forms.least_squares import Constraints

@@ -20,7 +20,8 @@ import numpy as np
 from problems.errors import DataError, SettingError, UnobservableError
 from problems.forms.graduated import ladder
 from problems.forms.layout import Layout
-from problems.forms.least_squares import Bound, Constraints, LeastSquares
+from problems.forms.costs import Bound
+from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.problem import Problem
 from problems.solvers.base import Options, Status
@@ -51,7 +52,6 @@ class Settings:
 
     Attributes:
         qp_solver: QP backend for inequalities; by default daqp for small problems and proxqp for large ones.
-        whole: one compiled function for the whole problem (True), array code (False), or by size (None).
         iterations: exact number of steps without convergence test (real-time iteration); None iterates to convergence.
         screen: answer steps that satisfy the linearized constraints by the linear solve; else the QP backend is always
             called.
@@ -62,7 +62,6 @@ class Settings:
     """
 
     qp_solver: str | None = None
-    whole: bool | None = None
     iterations: int | None = None
     screen: bool = True
     linear_solver: LinearSolver = "auto"
@@ -83,7 +82,7 @@ class GaussNewton(Session):
             raise SettingError(f"solver gauss-newton: iterations must be positive, got {self.settings.iterations}")
         layout = Layout(problem)
         super().__init__(problem, layout, "gauss-newton", options)
-        self.form_ = LeastSquares(problem, layout, self.settings.whole)
+        self.form_ = LeastSquares(problem, layout)
         self.pins = Pins(layout)
         self.constraints = Constraints(layout, self.pins.names)
         pattern = self.form_.pattern
@@ -92,7 +91,7 @@ class GaussNewton(Session):
         self.sparse = pattern.size > DENSE_SIZE and self._linear.name != "banded"
         rungs = ladder(problem) if self.settings.graduated else []
         self._known_gauge: tuple[bytes, str] | None = None
-        self._rungs = [LeastSquares(rung, Layout(rung), self.settings.whole) for rung in rungs]
+        self._rungs = [LeastSquares(rung, Layout(rung)) for rung in rungs]
         self._renew()
 
     @classmethod

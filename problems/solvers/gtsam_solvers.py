@@ -15,7 +15,8 @@ import numpy as np
 
 from problems.errors import FormError
 from problems.forms.factor_graph import FactorGraph, GraphTerm
-from problems.forms.least_squares import Bound, Constraints, LeastSquares
+from problems.forms.costs import Bound
+from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.template import template_of
 from problems.noise import L2, GemanMcClure
 from problems.problem import DataSlot, Problem
@@ -90,7 +91,7 @@ class GtsamSession(Session):
         self.graph = FactorGraph(problem)
         super().__init__(problem, self.graph.layout, self.name, options)
         self._require_affine_equalities()
-        self.least_squares = LeastSquares(problem, self.layout, whole=False)
+        self.least_squares = LeastSquares(problem, self.layout)
         self.constraints = Constraints(self.layout, self.graph.pins.names)
         self._reads = {term.name: self._positions(term.name) for term in self.graph.terms}
         self._factors: dict[str, tuple[bytes, list[Any]]] = {}

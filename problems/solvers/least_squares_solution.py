@@ -9,7 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from problems.forms.least_squares import Bound, Constraints, LeastSquares
+from problems.forms.costs import Bound
+from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.forms.selection import columns_of
 from problems.solvers.active import active_rows

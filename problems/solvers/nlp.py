@@ -91,7 +91,7 @@ class NLPSession(Session):
     def __init__(self, problem: Problem, options: Options) -> None:
         self.program = NonlinearProgram(problem)
         super().__init__(problem, self.program.layout, self.plugin, options)
-        self.least_squares = LeastSquares(problem, self.layout, whole=False)
+        self.least_squares = LeastSquares(problem, self.layout)
         self.pins = Pins(self.layout)
         self.constraints = Constraints(self.layout, self.pins.names)
         kept = [self.program.rows[e.term.name] for e in self.constraints.terms]

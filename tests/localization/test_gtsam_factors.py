@@ -107,7 +107,7 @@ def cost_and_error(problem: Problem, data: dict[str, Any], point: dict[str, Any]
     graph, values, _ = form.to_gtsam(data, point)
     session = problem.compile("gauss-newton")
     session.update(**data)
-    bound = LeastSquares(problem, form.layout, whole=False).bind(session.store)
+    bound = LeastSquares(problem, form.layout).bind(session.store)
     return bound.cost(form.layout.point(point)), graph.error(values)
 
 

@@ -125,7 +125,7 @@ def test_the_error_of_the_graph_is_the_cost_up_to_the_completed_squares(loss: Lo
     np.testing.assert_allclose(form.point(values), form.layout.point(point), rtol=1e-12, atol=1e-12)
     session = problem.compile("gauss-newton")
     session.update(**data)
-    bound = LeastSquares(problem, form.layout, whole=False).bind(session.store)
+    bound = LeastSquares(problem, form.layout).bind(session.store)
     here = form.layout.point(point)
     there = form.layout.retract(here, 0.2 * np.random.default_rng(4).normal(size=form.layout.size))
     completed = 0.5 * float((LINEAR**2 * 4).sum())  # of `moved`: linear' W^-1 linear / 2

@@ -49,7 +49,7 @@ def random_values(problem: Problem, rng: np.random.Generator) -> dict[str, np.nd
 
 def cost(problem: Problem, values: dict[str, np.ndarray]) -> float:
     layout = Layout(problem)
-    return LeastSquares(problem, layout, whole=False).bind(DataStore(layout)).cost(layout.point(values))
+    return LeastSquares(problem, layout).bind(DataStore(layout)).cost(layout.point(values))
 
 
 def problem_of(residual: Any, spaces: tuple[Space, ...], loss: Loss | None, rng: np.random.Generator) -> Problem:

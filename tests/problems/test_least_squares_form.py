@@ -1,4 +1,4 @@
-"""Costs and constraints on manifolds: both evaluators, patterns, pins and factorizations against plain NumPy."""
+"""Costs and constraints on manifolds: cost code, patterns, pins and factorizations against plain NumPy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import scipy.sparse as sp
 
 from problems import SE2, SO2, Cauchy, Gaussian, GemanMcClure, Huber, Problem, Tukey, Vector, wrap
 from problems.errors import DataError, UnobservableError
-from problems.forms import least_squares
-from problems.forms.cost_groups import ArrayCosts, MappedCosts, WholeCosts
 from problems.forms.layout import DataStore, Layout
 from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.pins import Pins
@@ -156,19 +154,6 @@ class World:
         return value, gradient, sum(w * J.T @ J for (_, w, _), J in zip(here, slopes, strict=True))
 
 
-WAYS = ("whole", "loop", "arrays", "mixed")
-
-
-def evaluator(p: Problem, layout: Layout, way: str) -> LeastSquares:
-    """Costs evaluated one way; mixed: terms of up to 5 instances by CasADi's loop, the others by array code."""
-    if way in ("whole", "arrays"):
-        return LeastSquares(p, layout, way == "whole")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(least_squares, "WHOLE_WORK", 0)
-        patch.setattr(least_squares, "LOOP_COUNT", 5 if way == "mixed" else 1000)
-        return LeastSquares(p, layout)
-
-
 def full(form: LeastSquares, entries: np.ndarray) -> np.ndarray:
     n = form.pattern.size
     H = np.zeros((n, n))
@@ -176,90 +161,67 @@ def full(form: LeastSquares, entries: np.ndarray) -> np.ndarray:
     return H + np.triu(H, 1).T
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_both_evaluators_equal_the_reference(seed: int) -> None:
+@pytest.mark.parametrize("seed", range(10))
+def test_costs_equal_the_reference(seed: int) -> None:
     world = World(seed)
     value, gradient, H = world.reference()
-    for way in WAYS:
-        form = evaluator(world.p, world.layout, way)
-        bound = form.bind(world.store)
-        cost, g, entries = bound.linearize(world.at)
-        assert cost == pytest.approx(value, rel=1e-12)
-        assert bound.cost(world.at) == pytest.approx(value, rel=1e-12)
-        np.testing.assert_allclose(g, gradient, atol=2e-7 * max(1.0, np.abs(gradient).max()))
-        np.testing.assert_allclose(full(form, entries), H, atol=2e-7 * max(1.0, np.abs(H).max()))
-
-
-@pytest.mark.parametrize("seed", range(6, 10))
-def test_the_evaluators_agree_to_rounding(seed: int) -> None:
-    world = World(seed)
-    one, *others = (evaluator(world.p, world.layout, way).bind(world.store) for way in WAYS)
-    for other in others:
-        for a, b in zip(one.linearize(world.at), other.linearize(world.at), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
-
-
-def turned(x: Any) -> Any:
-    for _ in range(40):
-        x = ca.sin(x) + 1
-    return x
-
-
-@pytest.mark.parametrize(
-    ("counts", "kinds"),
-    [
-        ((20,), [WholeCosts]),
-        ((150,), [MappedCosts]),  # too many instructions in all
-        ((150, 150), [MappedCosts]),
-        ((150, 301), [MappedCosts, ArrayCosts]),
-        ((301,), [ArrayCosts]),
-    ],
-)
-def test_evaluators_are_chosen_by_instructions_and_instances(counts: tuple[int, ...], kinds: list[type]) -> None:
-    p = Problem()
-    for k, count in enumerate(counts):
-        p.cost(f"c{k}", turned, on=p.variables(f"x{k}", Vector(1), count))
-    assert [type(group) for group in LeastSquares(p, Layout(p)).groups] == kinds
+    form = LeastSquares(world.p, world.layout)
+    bound = form.bind(world.store)
+    cost, g, entries = bound.linearize(world.at)
+    assert cost == pytest.approx(value, rel=1e-12)
+    assert bound.cost(world.at) == pytest.approx(value, rel=1e-12)
+    np.testing.assert_allclose(g, gradient, atol=2e-7 * max(1.0, np.abs(gradient).max()))
+    np.testing.assert_allclose(full(form, entries), H, atol=2e-7 * max(1.0, np.abs(H).max()))
+    alone, slope = bound.gradient(world.at)
+    assert alone == pytest.approx(cost, rel=1e-14)
+    np.testing.assert_allclose(slope, g, rtol=1e-12, atol=1e-12)
 
 
 def test_what_was_bound_does_not_follow_later_data() -> None:
-    for way in WAYS:
-        world = World(1)
-        form = evaluator(world.p, world.layout, way)
-        bound = form.bind(world.store)
-        before = [np.array(part) for part in bound.linearize(world.at)]
-        world.store.set("z", np.zeros((9, 2)))
-        world.store.set("spread", np.ones((9, 2)))
-        other = form.bind(world.store)
-        assert abs(other.cost(world.at) - bound.cost(world.at)) > 1e-3
-        for a, b in zip(before, bound.linearize(world.at), strict=True):
-            np.testing.assert_array_equal(a, b)
+    world = World(1)
+    form = LeastSquares(world.p, world.layout)
+    bound = form.bind(world.store)
+    before = [np.array(part) for part in bound.linearize(world.at)]
+    world.store.set("z", np.zeros((9, 2)))
+    world.store.set("spread", np.ones((9, 2)))
+    other = form.bind(world.store)
+    assert abs(other.cost(world.at) - bound.cost(world.at)) > 1e-3
+    for a, b in zip(before, bound.linearize(world.at), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_results_are_new_arrays() -> None:
-    for way in WAYS:
-        world = World(2)
-        bound = evaluator(world.p, world.layout, way).bind(world.store)
-        _, g, h = bound.linearize(world.at)
-        kept = g.copy(), h.copy()
-        bound.linearize(world.at + 0.1)
-        np.testing.assert_array_equal(g, kept[0])
-        np.testing.assert_array_equal(h, kept[1])
+    world = World(2)
+    bound = LeastSquares(world.p, world.layout).bind(world.store)
+    _, g, h = bound.linearize(world.at)
+    kept = g.copy(), h.copy()
+    bound.linearize(world.at + 0.1)
+    np.testing.assert_array_equal(g, kept[0])
+    np.testing.assert_array_equal(h, kept[1])
 
 
 def test_instances_that_are_off_count_nothing_even_where_they_are_not_finite() -> None:
-    for way in WAYS:
-        p = Problem()
-        x, z, on = p.variables("x", Vector(1), 3), p.data("z", (), 3), p.data("on", (), 3)
-        p.cost("c", lambda x, z: ca.log(x) - ca.sqrt(z), on=x, data=z, active=on)
-        form = evaluator(p, Layout(p), way)
-        store = DataStore(form.layout)
-        store.set("z", [4.0, np.nan, -1.0])
-        store.set("on", [1, 1, 0])
-        cost, g, h = form.bind(store).linearize(np.array([1.0, -1.0, -1.0]))
-        assert cost == pytest.approx(2.0)
-        np.testing.assert_allclose(g, [-2.0, 0.0, 0.0])
-        np.testing.assert_allclose(h, [1.0, 0.0, 0.0])
+    p = Problem()
+    x, z, on = p.variables("x", Vector(1), 3), p.data("z", (), 3), p.data("on", (), 3)
+    p.cost("c", lambda x, z: ca.log(x) - ca.sqrt(z), on=x, data=z, active=on)
+    form = LeastSquares(p, Layout(p))
+    store = DataStore(form.layout)
+    store.set("z", [4.0, np.nan, -1.0])
+    store.set("on", [1, 1, 0])
+    cost, g, h = form.bind(store).linearize(np.array([1.0, -1.0, -1.0]))
+    assert cost == pytest.approx(2.0)
+    np.testing.assert_allclose(g, [-2.0, 0.0, 0.0])
+    np.testing.assert_allclose(h, [1.0, 0.0, 0.0])
+
+
+def test_a_problem_without_costs_costs_nothing() -> None:
+    p = Problem()
+    p.inequality("box", lambda x: x, on=p.variables("x", Vector(2)), lower=0.0)
+    layout = Layout(p)
+    bound = LeastSquares(p, layout).bind(DataStore(layout))
+    cost, g, h = bound.linearize(np.ones(2))
+    assert cost == bound.cost(np.ones(2)) == 0.0
+    assert not g.any() and not h.any() and g.size == 2
 
 
 def test_instances_of_inequalities_that_are_off_read_zero() -> None:
@@ -358,7 +320,7 @@ def test_pins_take_rows_and_columns_out_of_the_hessian() -> None:
 
 def pattern_and_matrix(seed: int, shift: float) -> tuple[Any, np.ndarray, np.ndarray]:
     world = World(seed)
-    form = LeastSquares(world.p, world.layout, False)
+    form = LeastSquares(world.p, world.layout)
     rng = np.random.default_rng(seed)
     n = form.pattern.size
     rows, columns = form.pattern.indices, np.repeat(np.arange(n), np.diff(form.pattern.indptr))

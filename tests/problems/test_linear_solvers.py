@@ -55,7 +55,7 @@ def chain(space: Any, count: int, all_pairs: bool = False) -> Problem:
 
 
 def work(problem: Problem) -> float:
-    return problem.compile("gauss-newton", whole=False).form_.pattern.work  # type: ignore[attr-defined]
+    return problem.compile("gauss-newton").form_.pattern.work  # type: ignore[attr-defined]
 
 
 def test_work_is_what_elimination_takes() -> None:
@@ -72,8 +72,8 @@ def test_every_linear_solver_reaches_the_same_optimum(name: str) -> None:
         pytest.importorskip(PACKAGES[name])
     problem, truth = poses(60, np.random.default_rng(0))
     start = SE3.retract_array(truth, 0.1 * np.random.default_rng(1).normal(size=(60, 6)))
-    expected = problem.compile("gauss-newton", whole=False, linear_solver="qdldl").solve(initial={"pose": start})
-    session: Any = problem.compile("gauss-newton", whole=False, linear_solver=name)
+    expected = problem.compile("gauss-newton", linear_solver="qdldl").solve(initial={"pose": start})
+    session: Any = problem.compile("gauss-newton", linear_solver=name)
     assert session._linear.name == name
     for one in (session, session.fork()):
         solution = one.solve(initial={"pose": start})
@@ -84,7 +84,7 @@ def test_every_linear_solver_reaches_the_same_optimum(name: str) -> None:
 
 def test_auto_goes_by_size_and_work(monkeypatch: pytest.MonkeyPatch) -> None:
     def chosen(problem: Problem) -> str:
-        session: Any = problem.compile("gauss-newton", whole=False)
+        session: Any = problem.compile("gauss-newton")
         return session._linear.name
 
     assert chosen(chain(SE2, 40)) == "banded"
@@ -110,16 +110,16 @@ def test_auto_goes_by_size_and_work(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_unknown_and_missing_linear_solvers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = chain(SE2, 60)
     with pytest.raises(SettingError, match="linear_solver"):
-        problem.compile("gauss-newton", whole=False, linear_solver="mumps")
+        problem.compile("gauss-newton", linear_solver="mumps")
     monkeypatch.setattr(factorizations, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"horizonet\[pardiso\]"):
-        problem.compile("gauss-newton", whole=False, linear_solver="pardiso")
+        problem.compile("gauss-newton", linear_solver="pardiso")
 
 
 def test_the_last_factorization_serves_again() -> None:
     problem, truth = poses(60, np.random.default_rng(2), noise=0.15)
     start = {"pose": SE3.retract_array(truth, 0.2 * np.random.default_rng(3).normal(size=(60, 6)))}
-    session: Any = problem.compile("gauss-newton", whole=False, linear_solver="qdldl")
+    session: Any = problem.compile("gauss-newton", linear_solver="qdldl")
     calls, inner = [], session._linear.factor
 
     def factor(values: np.ndarray) -> None:
@@ -130,7 +130,7 @@ def test_the_last_factorization_serves_again() -> None:
     solution = session.solve(initial=start)
     assert solution.status == "solved"
     assert len(calls) <= solution.iterations - 2
-    exact = problem.compile("gauss-newton", whole=False, tolerance=1e-13, linear_solver="qdldl").solve(initial=start)
+    exact = problem.compile("gauss-newton", tolerance=1e-13, linear_solver="qdldl").solve(initial=start)
     assert solution.objective - exact.objective <= 1e-9 * max(1.0, exact.objective)
     # warm: one linearization and no factorization more than the test of convergence takes
     again = len(calls)

@@ -99,7 +99,7 @@ def test_objective_is_the_cost_at_the_retracted_point() -> None:
     store = program.store(data)
     layout, reference = program.layout, program.layout.point(point)
     v = 0.5 * rng.normal(size=layout.size)
-    bound = LeastSquares(problem, layout, whole=False).bind(store)
+    bound = LeastSquares(problem, layout).bind(store)
     value = ca.Function("f", [program.variables, program.parameter], [program.objective])
     ours = float(value(v, program.parameters(store, reference)))
     assert ours == pytest.approx(bound.cost(layout.retract(reference, v)), rel=1e-12)

@@ -166,18 +166,17 @@ def test_weights_given_as_data_equal_constant_ones_in_every_shape(
         np.testing.assert_allclose(dense(got.P), want.P, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(got.q, want.q, rtol=1e-9, atol=1e-12)
     z = rng.normal(size=2 * instances)
-    for whole in (True, False):
-        results = []
-        for p in (given, fixed):
-            layout = Layout(p)
-            form = LeastSquares(p, layout, whole)
-            store = DataStore(layout)
-            if p is given:
-                store.set("weight", value)
-            results.append(form.bind(store).linearize(z))
-        for a, b in zip(*results, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(results[0][1], want.P @ z + want.q, rtol=1e-8, atol=1e-10)
+    results = []
+    for p in (given, fixed):
+        layout = Layout(p)
+        form = LeastSquares(p, layout)
+        store = DataStore(layout)
+        if p is given:
+            store.set("weight", value)
+        results.append(form.bind(store).linearize(z))
+    for a, b in zip(*results, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(results[0][1], want.P @ z + want.q, rtol=1e-8, atol=1e-10)
 
 
 def test_one_instance_in_two_slots_counts_twice() -> None:

@@ -48,7 +48,7 @@ def test_landmarks_are_what_is_eliminated() -> None:
     session = problem.compile("gauss-newton")
     session.update(**data)
     layout = Layout(problem)
-    form = LeastSquares(problem, layout, whole=False)
+    form = LeastSquares(problem, layout)
     (gone,) = form.pattern.independent_blocks()
     assert gone.shape == (80, 2) and gone.min() == layout.start["mark"]
     _, gradient, values = form.bind(session.store).linearize(layout.point(start))
@@ -64,7 +64,7 @@ def test_landmarks_are_what_is_eliminated() -> None:
 def test_a_free_gauge_is_singular() -> None:
     problem, data, start = survey()
     layout = Layout(problem)
-    form = LeastSquares(problem, layout, whole=False)
+    form = LeastSquares(problem, layout)
     values = np.zeros(form.pattern.nonzeros)
     with pytest.raises(SingularError):
         SchurComplement(form.pattern).factor(values)
