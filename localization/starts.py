@@ -7,7 +7,7 @@ Source: specs ``recordings`` 3 and 5, ``gps-range-bearing-localization`` 10.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -21,7 +21,7 @@ from problems.noise import Gaussian
 from problems.problem import Problem
 from problems.solvers.session import Solution
 from problems.spaces import SE2, Space, Vector
-from problems.spatial import SE3, rotate_array
+from problems.spatial import SE3, quaternion_product, rotate_array
 
 DRIFT = 2.0  # m, of chained poses while a landmark is located by ranges from them
 
@@ -169,22 +169,30 @@ def _chained(graph: PoseGraph, space: Space, roots: dict[int, np.ndarray]) -> tu
 
 
 def _composed(space: Space, poses: np.ndarray, parent: np.ndarray) -> np.ndarray:
-    """Poses given in the frame of their parents, in the frame of the roots (their own parents), by pointer doubling."""
-    parent = parent.copy()
-    waiting = np.flatnonzero(parent != np.arange(len(parent)))
-    settled = parent == np.arange(len(parent))
-    while waiting.size:
-        over = parent[waiting]
-        poses[waiting] = _product(space, poses[over], poses[waiting])
-        settled_now = settled[over]
-        parent[waiting] = parent[over]
-        settled[waiting[settled_now]] = True
-        waiting = waiting[~settled_now]
-    return poses
+    """Poses given in the frame of their parents, in the frame of the roots (their own parents).
+
+    Orientations first: with them known, positions are sums along the tree.
+    """
+    size, count = (2, 3)[space is SE3], len(poses)
+    above = np.append(np.where(parent == np.arange(count), count, parent), count)  # the last one stands for the world
+    if size == 2:
+        angle = _along(above, np.append(poses[:, 2], 0.0)[:, None], np.add)
+    else:
+        angle = _along(above, np.vstack([poses[:, 3:], [0, 0, 0, 1]]), quaternion_product)
+    turned = space.normalize_array(np.column_stack([np.zeros((count + 1, size)), angle]))
+    step = np.zeros((count, space.dim))
+    step[:, :size] = poses[:, :size]
+    moved = space.retract_array(turned[above[:-1]], step)[:, :size]
+    turned[:, :size] = _along(above, np.vstack([moved, np.zeros(size)]), np.add)
+    return turned[:-1]
 
 
-def _product(space: Space, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return space.retract_array(a, space.local_array(np.broadcast_to(space.identity(), b.shape), b))
+def _along(parent: np.ndarray, values: np.ndarray, product: Callable[[Any, Any], np.ndarray]) -> np.ndarray:
+    """Products of values from the last one, the root, to each, by pointer doubling."""
+    root = len(parent) - 1
+    while (parent != root).any():
+        values, parent = product(values.take(parent, axis=0), values), parent.take(parent)
+    return values
 
 
 def _inverse(space: Space, poses: np.ndarray) -> np.ndarray:
