@@ -282,7 +282,7 @@ def factorization(pattern: HessianPattern, solver: LinearSolver = "auto") -> Fac
 
 def check_values(values: np.ndarray, pattern: HessianPattern) -> None:
     """Raises SingularError where no factorization could succeed."""
-    if not np.isfinite(values).all():
+    if not values.dot(values) < np.inf and not np.isfinite(values).all():
         raise SingularError("the matrix is not finite")
     if (values[pattern.diagonal] <= 0).any():
         raise SingularError("a diagonal entry is not positive")

@@ -184,12 +184,12 @@ class GaussNewton(Session):
             return ""
         key = b"|".join(b"" if on is None else on.tobytes() for on in search.bound.flags.values())
         if self._known_gauge is None or self._known_gauge[0] != key:
-            hessian = search.hessian
+            hessian, damped = search.hessian, search.factored != 0
             if not self.settings.screen:  # nothing was factorized yet
-                damped = hessian.copy()
-                damped[self.form_.pattern.diagonal] *= 1 + 1e-10
-                self._linear.factor(damped)
-            self._known_gauge = key, gauge_freedom(self.form_.pattern, hessian, self._linear, self.layout)
+                shifted, damped = hessian.copy(), True
+                shifted[self.form_.pattern.diagonal] *= 1 + 1e-10
+                self._linear.factor(shifted)
+            self._known_gauge = key, gauge_freedom(self.form_.pattern, hessian, self._linear, self.layout, damped)
         return self._known_gauge[1]
 
 
@@ -201,6 +201,7 @@ class _Search:
         self.options, self.layout = session.options, session.layout
         self.diagonal = session.form_.pattern.diagonal
         self.damping = 0.0
+        self.factored = 0.0  # damping of the matrix that was factorized last
         self.iterations = 0
         self.multipliers: np.ndarray | None = None
         self.hessian: np.ndarray | None = None  # at the last linearization
@@ -277,6 +278,7 @@ class _Search:
                     step = kept
                 elif session.settings.screen and damped is not None:
                     session._linear.factor(damped)
+                    self.factored = self.damping
                     step = -session._linear.solve(gradient)
                     if not step.dot(step) < np.inf:
                         raise SingularError("no finite step")

@@ -24,7 +24,8 @@ from problems.forms.sparsity import HessianPattern
 from problems.solvers.base import Options, Status
 from problems.solvers.factorizations import Factorization, SingularError, factorization
 
-GROWTH = 1e2  # of a general direction by an inverse iteration, below which none is free, nor by a damped matrix
+GROWTH = 1e9  # of a general direction by an inverse iteration, below which none is free
+DAMPED_GROWTH = 1e2  # the same by a factorization of a damped matrix, which bounds it
 LOOSE = 1e-13  # curvature along a direction, in the scale of the diagonal, that is none
 RIDGE = 1e-12  # of the largest diagonal entry, added so that directions the costs leave free have finite steps
 
@@ -118,11 +119,13 @@ def optimality(
     return Optimality(cost, share + gap, violation, free)
 
 
-def gauge_freedom(pattern: HessianPattern, hessian: np.ndarray, solver: Factorization, layout: Layout) -> str:
+def gauge_freedom(
+    pattern: HessianPattern, hessian: np.ndarray, solver: Factorization, layout: Layout, damped: bool = True
+) -> str:
     """Says which unknowns move along a direction without curvature; empty where every direction has some.
 
     Args:
-        solver: holds a factorization of `hessian`, also of a damped one; the direction comes by inverse iteration.
+        solver: holds a factorization of `hessian`, or of a `damped` one; the direction comes by inverse iteration.
     """
     diagonal = hessian[pattern.diagonal]
     direction = np.cos(np.arange(pattern.size))
@@ -132,7 +135,7 @@ def gauge_freedom(pattern: HessianPattern, hessian: np.ndarray, solver: Factoriz
         size = float(np.sqrt(np.sum(diagonal * direction**2)))
         if not (np.isfinite(size) and size > 0):
             return ""
-        if attempt == 0 and size < GROWTH * before:
+        if attempt == 0 and size < (DAMPED_GROWTH if damped else GROWTH) * before:
             return ""
         direction /= size
     columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))

@@ -59,6 +59,27 @@ def test_missing_data_can_free_a_gauge() -> None:
         assert ("x[0] and 1 more" in solution.message) == free
 
 
+def test_long_chains_with_and_without_an_anchor() -> None:
+    """Stretched directions of a long held chain are no gauge; the same chain held nowhere is found free."""
+    count = 400
+    for held in (True, False):
+        p = Problem("chain")
+        pose = p.variables("pose", SE2, count)
+        before, after = np.append(np.arange(count - 1), 0), np.append(np.arange(1, count), 5)
+        value = np.tile([1.0, 0.0, 0.01], (count, 1))
+        value[-1] = [5.01, 0.1, 0.05]
+        z = p.data("z", 3, count, value)
+        p.cost("step", lambda a, b, z: a.between(b).local() - z, (pose[before], pose[after]), z, Gaussian(0.01))
+        if held:
+            p.equality("origin", lambda T: ca.vertcat(T.translation, T.angle), pose[0])
+        start = [np.zeros(3)]
+        for _ in range(count - 1):
+            start.append(SE2.retract_array(start[-1][None], np.array([[1.0, 0.0, 0.01]]))[0])
+        solution = p.compile("gauss-newton", linear_solver="qdldl").solve(initial={"pose": np.array(start)})
+        assert solution.status is Status.SOLVED, solution.message
+        assert ("one of many optima" in solution.message) == (not held)
+
+
 def test_initial_values_after_a_preparation_are_refused() -> None:
     problem, start = loop("weak prior")
     session = problem.compile("gauss-newton")
