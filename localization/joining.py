@@ -185,7 +185,7 @@ def _minima(links: _Links, drift: float) -> list[tuple[float, np.ndarray]]:
         start, end = problem.data("start", 2, count, links.start), problem.data("end", 2, count, links.end)
         z = problem.data("ranges", (), count, links.ranges)
         problem.cost("ranges", _ranged, frame, (start, end, z), Gaussian(drift), Cauchy(2.0))
-    session = problem.compile("gauss-newton", whole=False)
+    session = problem.compile("gauss-newton")
     found: list[tuple[float, np.ndarray]] = []
     for guess in _guesses(links):
         session.reset()

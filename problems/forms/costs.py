@@ -4,7 +4,7 @@ stands and adds cost, gradient and Hessian entries where they belong.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, cached_property, lru_cache
 
 import numpy as np
@@ -12,8 +12,8 @@ from scipy.linalg.lapack import dpotrf  # type: ignore[attr-defined]
 
 from problems.forms.kernels import CostKernel, cost_kernel
 from problems.forms.layout import DataStore, Layout, TermLayout, constant_rows, constant_whitening, noise_numbers
-from problems.forms.loops import SUM_TASK, address, sequence, summing_loop
-from problems.forms.machine_code import Code, caller
+from problems.forms.loops import SUM_TASK, Program, address, summing_loop
+from problems.forms.machine_code import Code
 from problems.forms.sparsity import HessianPattern
 from problems.forms.template import template_of
 from problems.noise import whitening
@@ -106,6 +106,7 @@ class CostCode:
 
     Attributes:
         size, nonzeros: of gradient and Hessian.
+        point, sums: what programs read and add to: cost, gradient, Hessian entries, and one place of no account.
     """
 
     def __init__(self, layout: Layout, costs: Sequence[Cost], pattern: HessianPattern) -> None:
@@ -114,15 +115,15 @@ class CostCode:
         self._index: list[np.ndarray] = []
         constants = self._place(layout)
         self._values = np.concatenate([np.zeros(self.free), *constants])
-        self._point = np.zeros(layout.stored_size)
-        self._sums = np.zeros(2 + self.size + self.nonzeros)  # the last one takes what is added nowhere
+        self.point = np.zeros(layout.stored_size)
+        self.sums = np.zeros(2 + self.size + self.nonzeros)  # the last one takes what is added nowhere
         added = [self._added(cost, positions) for cost, positions in zip(costs, pattern.positions, strict=True)]
         self._targets, self._outputs = [one[0] for one in added], [one[1] for one in added]
         self._tasks = np.array(
             [
                 (c.count, 0, address(index), address(targets), targets.shape[1], *map(address, shared))
                 for c, index, targets in zip(costs, self._index, self._targets, strict=True)
-                for shared in [(self._point, self._values, self._sums)]
+                for shared in [(self.point, self._values, self.sums)]
             ],
             np.int64,
         ).reshape(len(costs), len(SUM_TASK))
@@ -140,43 +141,38 @@ class CostCode:
             at += size
         return Bound(self, numbers, flags, parameters)
 
-    def sums(self, bound: Bound, point: np.ndarray, run: Callable[[], None], size: int) -> np.ndarray:
-        """The first `size` sums that `run` makes of what is bound."""
+    def enter(self, bound: Bound) -> None:
+        """Let programs read what is bound."""
         if self._entered is not bound:
             self._values[: self.free] = bound.parameters
             on = [bound.flags[cost.term.name] for cost in self._costs]
             self._tasks[:, SUM_TASK.index("flags")] = [0 if one is None else address(one) for one in on]
             self._entered = bound
-        self._point[:] = point
-        self._sums[:size] = 0.0
+
+    def sums_of(self, bound: Bound, point: np.ndarray, run: Program, size: int) -> np.ndarray:
+        """The first `size` sums that a program makes of what is bound."""
+        self.enter(bound)
+        self.point[:] = point
+        self.sums[:size] = 0.0
         run()
-        return self._sums[:size].copy()
+        return self.sums[:size].copy()
 
     @cached_property
-    def cost(self) -> Callable[[], None]:
+    def cost(self) -> Program:
         return self._program("value_function", [(0,)] * len(self._costs))
 
     @cached_property
-    def gradient(self) -> Callable[[], None]:
+    def gradient(self) -> Program:
         return self._program("gradient_function", [tuple(range(1 + c.template.width)) for c in self._costs])
 
     @cached_property
-    def linearization(self) -> Callable[[], None]:
+    def linearization(self) -> Program:
         return self._program("function", self._outputs)
 
-    def _program(self, function: str, outputs: Sequence[tuple[int, ...]]) -> Callable[[], None]:
-        """One call that adds `outputs` of a function of every kernel."""
+    def _program(self, function: str, outputs: Sequence[tuple[int, ...]]) -> Program:
+        """Adds `outputs` of a function of every kernel."""
         codes = [_loop(c.kernel, function, wanted) for c, wanted in zip(self._costs, outputs, strict=True)]
-        steps = [len(codes)]
-        for code, task in zip(codes, self._tasks, strict=True):
-            steps += [code.address, address(task)]
-        given, call = np.array(steps), caller(sequence().address)
-        where = address(given)
-
-        def run(_alive: object = (given, codes, self._tasks)) -> None:
-            call(where)
-
-        return run
+        return Program(codes, self._tasks)
 
     def _place(self, layout: Layout) -> list[np.ndarray]:
         """Where every cost reads its inputs; what follows the first `free` numbers."""
@@ -223,28 +219,29 @@ class Bound:
     """Costs for fixed data, as functions of the point alone.
 
     Attributes:
+        code: of which they are.
         numbers: the data, zeros where they are missing.
         flags: which instances are on, by name of the term.
         parameters: what kernels read beside the point, as far as it may change.
     """
 
     def __init__(self, code: CostCode, numbers: np.ndarray, flags: Flags, parameters: np.ndarray) -> None:
-        self._code, self.numbers, self.flags, self.parameters = code, numbers, flags, parameters
+        self.code, self.numbers, self.flags, self.parameters = code, numbers, flags, parameters
 
     def cost(self, point: np.ndarray) -> float:
-        return float(self._code.sums(self, point, self._code.cost, 1)[0])
+        return float(self.code.sums_of(self, point, self.code.cost, 1)[0])
 
     def gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
         """Cost and gradient (size,), in new arrays."""
-        code = self._code
-        sums = code.sums(self, point, code.gradient, 1 + code.size)
+        code = self.code
+        sums = code.sums_of(self, point, code.gradient, 1 + code.size)
         return float(sums[0]), sums[1:]
 
     def linearize(self, point: np.ndarray) -> Linearization:
         """Cost, gradient (size,), Hessian entries in the order of the pattern, in new arrays."""
-        code = self._code
+        code = self.code
         start = 1 + code.size
-        sums = code.sums(self, point, code.linearization, start + code.nonzeros)
+        sums = code.sums_of(self, point, code.linearization, start + code.nonzeros)
         return float(sums[0]), sums[1:start], sums[start:]
 
 

@@ -152,7 +152,11 @@ class TermLayout:
 
 
 class Layout:
-    """Positions of variables, data and terms of a problem."""
+    """Positions of variables, data and terms of a problem.
+
+    Attributes:
+        flat: all variables are vectors, so that a point moves by addition.
+    """
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -170,7 +174,7 @@ class Layout:
             block += variable.count
             dims.append(np.full(variable.count, variable.space.dim))
         self.stored_size, self.size = stored, tangent
-        self._flat = all(isinstance(variable.space, Vector) for variable in problem.unknowns.values())
+        self.flat = all(isinstance(variable.space, Vector) for variable in problem.unknowns.values())
         self.block_dims = np.concatenate(dims) if dims else np.zeros(0, int)
         self.block_columns = np.concatenate([[0], np.cumsum(self.block_dims)]).astype(np.intp)
         self.data_start: dict[str, int] = {}
@@ -270,7 +274,7 @@ class Layout:
 
     def retract(self, point: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The point moved by a tangent step."""
-        if self._flat:
+        if self.flat:
             return point + step
         out = np.empty_like(point)
         for name, variable in self.problem.unknowns.items():
@@ -292,6 +296,7 @@ class DataStore:
         self._views: dict[str, np.ndarray] = {}
         inputs = layout.problem.inputs
         self._flags = {d.of.name: d.name for d in inputs.values() if d.of is not None}
+        self._derived = frozenset(self._flags.values())
         for name, entry in inputs.items():
             start = layout.data_start[name]
             self._views[name] = self.numbers[start : start + entry.rows * entry.size].reshape(entry.rows, entry.size)
@@ -311,8 +316,8 @@ class DataStore:
     def set(self, name: str, value: Any) -> None:
         """Take new numbers. Raises UnknownNameError, ShapeError or DataError."""
         view = self._views.get(name)
-        if view is None or name in self._flags.values():
-            raise UnknownNameError("data", name, [n for n in self._views if n not in self._flags.values()])
+        if view is None or name in self._derived:
+            raise UnknownNameError("data", name, [n for n in self._views if n not in self._derived])
         if type(value) is np.ndarray and value.shape == view.shape and value.dtype == float:
             view[...] = value
         else:

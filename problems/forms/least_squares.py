@@ -25,7 +25,7 @@ class LeastSquares:
         self.activity = Activity(layout)
         self.costs = costs = [Cost(layout, entry) for entry in layout.terms if entry.term.kind == "cost"]
         self.pattern = HessianPattern(layout, [(c.entry, c.kernel.pairs) for c in costs])
-        self._code = CostCode(layout, costs, self.pattern)
+        self.code = CostCode(layout, costs, self.pattern)
         self._flags: dict[bytes, Flags] = {}
 
     def bind(self, store: DataStore) -> Bound:
@@ -43,7 +43,7 @@ class LeastSquares:
             self._flags[key] = flags
         if not finite:
             store.require_finite()
-        return self._code.bind(store, numbers.copy() if finite else np.where(np.isnan(numbers), 0.0, numbers), flags)
+        return self.code.bind(store, numbers.copy() if finite else np.where(np.isnan(numbers), 0.0, numbers), flags)
 
 
 class Constraints:
@@ -57,7 +57,7 @@ class Constraints:
         self.layout = layout
         kinds = ("equality", "inequality")
         self.terms = [e for kind in kinds for e in layout.terms if e.term.kind == kind and e.term.name not in skip]
-        self._codes = [residual_code(e.term) for e in self.terms]
+        self.codes = [residual_code(e.term) for e in self.terms]
         self.dims = [template_of(e.term).dim for e in self.terms]
         sizes = [e.term.count * d for e, d in zip(self.terms, self.dims, strict=True)]
         self.size = sum(sizes)
@@ -77,7 +77,7 @@ class Constraints:
         Those of instances that are off are zero, whatever their data would give.
         """
         values, entries = [np.zeros(0)], [np.zeros(0)]
-        for e, code in zip(self.terms, self._codes, strict=True):
+        for e, code in zip(self.terms, self.codes, strict=True):
             inputs = [*point[e.stored].T, *numbers[e.numbers].T]
             r, J = code.residual_and_jacobian([np.ascontiguousarray(v) for v in inputs], e.term.count)
             on = flags.get(e.term.name)
@@ -90,7 +90,7 @@ class Constraints:
     def residual(self, point: np.ndarray, numbers: np.ndarray, flags: Flags) -> np.ndarray:
         """Rows alone."""
         values = [np.zeros(0)]
-        for e, code in zip(self.terms, self._codes, strict=True):
+        for e, code in zip(self.terms, self.codes, strict=True):
             inputs = [*point[e.stored].T, *numbers[e.numbers].T]
             r = code.residual([np.ascontiguousarray(v) for v in inputs], e.term.count)
             on = flags.get(e.term.name)

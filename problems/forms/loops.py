@@ -7,11 +7,12 @@ keeps what its addresses point to.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import casadi as ca
 import numpy as np
 
-from problems.forms.machine_code import Code, compiled, straight_line
+from problems.forms.machine_code import Code, caller, compiled, straight_line
 
 SUM_TASK = ("count", "flags", "index", "targets", "width", "point", "values", "sums")
 """Fields of a task of `summing_loop`.
@@ -83,13 +84,10 @@ def column_loop(function: ca.Function) -> Code:
 
 def _loop(names: Sequence[str], integers: Sequence[str], body: Sequence[str], switched: bool = False) -> list[str]:
     """A function that unpacks its task and runs `body` for ``%i`` from 0; where `switched`, if its flag is not 0."""
-    head = ["define void @run(ptr %task) nounwind {", "entry:"]
-    for k, name in enumerate(names):
-        head += [
-            f"%task.{name} = getelementptr i64, ptr %task, i64 {k}",
-            f"%{name} = load {'i64' if name in integers else 'ptr'}, ptr %task.{name}",
-        ]
-    head += [
+    head = [
+        "define void @run(ptr %task) nounwind {",
+        "entry:",
+        *unpacked(names, integers),
         "%none = icmp eq i64 %count, 0",
         "br i1 %none, label %end, label %next",
         "next:",
@@ -120,7 +118,43 @@ def _loop(names: Sequence[str], integers: Sequence[str], body: Sequence[str], sw
     return [*head, "on:", *body, *tail]
 
 
-def sequence() -> Code:
+def unpacked(names: Sequence[str], integers: Sequence[str]) -> list[str]:
+    """Lines that read the fields of ``%task``: `integers`, the others are addresses."""
+    lines = []
+    for k, name in enumerate(names):
+        lines += [
+            f"%task.{name} = getelementptr i64, ptr %task, i64 {k}",
+            f"%{name} = load {'i64' if name in integers else 'ptr'}, ptr %task.{name}",
+        ]
+    return lines
+
+
+def address(array: np.ndarray) -> int:
+    """Where the numbers of an array are."""
+    return array.__array_interface__["data"][0]
+
+
+class Program:
+    """Loops and their tasks, run by one call.
+
+    Attributes:
+        code, task: addresses of a function and of what it is given.
+    """
+
+    def __init__(self, codes: Sequence[Code], tasks: np.ndarray) -> None:
+        steps = [len(codes)]
+        for code, task in zip(codes, tasks, strict=True):
+            steps += [code.address, address(task)]
+        given = np.array(steps)
+        self.code, self.task = _sequence().address, address(given)
+        self._call, self._alive = caller(self.code), (given, codes, tasks)
+
+    def __call__(self) -> None:
+        self._call(self.task)
+
+
+@cache
+def _sequence() -> Code:
     """Code that runs several loops; its task is a count and, for each, the addresses of its code and of its task."""
     return compiled(
         "\n".join(
@@ -149,8 +183,3 @@ def sequence() -> Code:
             ]
         )
     )
-
-
-def address(array: np.ndarray) -> int:
-    """Where the numbers of an array are."""
-    return array.__array_interface__["data"][0]

@@ -74,25 +74,30 @@ class DenseCholesky:
 
 
 class BandedCholesky:
-    """LAPACK Cholesky of a band: for chains, such as the states of a window, in the order of time."""
+    """LAPACK Cholesky of a band: for chains, such as the states of a window, in the order of time.
+
+    Attributes:
+        width: diagonals above the main one.
+        places: of the entries of the pattern in the band as LAPACK reads it, (width + 1, size) by columns.
+    """
 
     name: ClassVar[str] = "banded"
 
     def __init__(self, pattern: HessianPattern) -> None:
         columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-        self._width = pattern.bandwidth
-        self._flat = columns * (self._width + 1) + self._width + pattern.indices - columns
-        self._band = np.zeros((self._width + 1) * pattern.size)
+        self.width = pattern.bandwidth
+        self.places = columns * (self.width + 1) + self.width + pattern.indices - columns
+        self._band = np.zeros((self.width + 1) * pattern.size)
         # its transpose is what LAPACK reads by columns
-        self._matrix = self._band.reshape(pattern.size, self._width + 1).T
+        self._matrix = self._band.reshape(pattern.size, self.width + 1).T
         self._factor: Any = None
 
     def factor(self, values: np.ndarray) -> None:
-        self._band[self._flat] = values
+        self._band[self.places] = values
         self._factor, info = dpbtrf(self._matrix)
         if info != 0:
             raise SingularError(f"leading minor {info} is not positive")
-        diagonal = self._factor[self._width]
+        diagonal = self._factor[self.width]
         if not diagonal.dot(diagonal) < np.inf:
             raise SingularError("the matrix is not finite")
 

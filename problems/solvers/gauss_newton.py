@@ -18,15 +18,17 @@ from typing import Any
 import numpy as np
 
 from problems.errors import DataError, SettingError, UnobservableError
+from problems.forms.costs import Bound
 from problems.forms.graduated import ladder
 from problems.forms.layout import Layout
-from problems.forms.costs import Bound
 from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.problem import Problem
 from problems.solvers.base import Options, Status
+from problems.solvers.chain_steps import SHORT, ChainSteps
 from problems.solvers.factorizations import (
     DENSE_SIZE,
+    BandedCholesky,
     LinearSolver,
     SingularError,
     factorization,
@@ -41,8 +43,8 @@ from problems.solvers.settings import own_version
 DAMPING_START = 1e-6
 DAMPING_LIMIT = 1e12
 NEAR = 1e-4  # share of the cost below which a decrease says that the matrix hardly changes, in weak directions neither
-SHORT = 1e-6  # squared length of a step that is taken without a look at the cost where its decrease shows convergence
 CONTRACTION = 0.1  # share of the last decrease below which a step with the kept matrix is taken
+DEFAULT_LIMIT = 100  # iterations
 RUNG_ITERATIONS = 10  # of each wider loss in graduated non-convexity
 
 
@@ -89,6 +91,7 @@ class GaussNewton(Session):
         self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._linear = factorization(pattern, self.settings.linear_solver)
         self.sparse = pattern.size > DENSE_SIZE and self._linear.name != "banded"
+        self._chain = self._chain_steps()
         rungs = ladder(problem) if self.settings.graduated else []
         self._known_gauge: tuple[bytes, str] | None = None
         self._rungs = [LeastSquares(rung, Layout(rung)) for rung in rungs]
@@ -102,8 +105,17 @@ class GaussNewton(Session):
     def version(cls) -> str:
         return own_version()
 
+    def _chain_steps(self) -> ChainSteps | None:
+        """Steps by one call each, where the problem is a chain that nothing constrains."""
+        plain = not self.constraints.size and not self.pins.columns.size and self.layout.flat
+        usual = self.settings.screen and self.settings.iterations is None
+        if plain and usual and isinstance(self._linear, BandedCholesky):
+            return ChainSteps(self.form_.code, self._linear)
+        return None
+
     def _forked(self) -> None:
         self._linear = factorization(self.form_.pattern, self.settings.linear_solver)
+        self._chain = self._chain_steps()
         self._renew()
 
     def reset(self) -> None:
@@ -160,10 +172,11 @@ class GaussNewton(Session):
                 wider.run(RUNG_ITERATIONS)
                 start, iterations = wider.point, iterations + wider.iterations
             search = _Search(self, bound, start)
+            search.iterations = iterations
             violation = self.pins.violation(search.point, bound.numbers)
             if violation <= 10 * self.options.tolerance:
-                status, message = search.run()
-                search.iterations += iterations
+                chained = self._chain is not None and search.follow(self._chain)
+                status, message = (Status.SOLVED, "") if chained else search.run()
             else:
                 names = ", ".join(sorted(self.pins.names))
                 status, message = Status.INFEASIBLE, f"no point found that satisfies {names}: {violation:.3g} remains"
@@ -185,6 +198,8 @@ class GaussNewton(Session):
         key = b"|".join(b"" if on is None else on.tobytes() for on in search.bound.flags.values())
         if self._known_gauge is None or self._known_gauge[0] != key:
             hessian, damped = search.hessian, search.factored != 0
+            if search.chained:  # which has a factor of its own
+                self._linear.factor(hessian)
             if not self.settings.screen:  # nothing was factorized yet
                 shifted, damped = hessian.copy(), True
                 shifted[self.form_.pattern.diagonal] *= 1 + 1e-10
@@ -203,6 +218,7 @@ class _Search:
         self.damping = 0.0
         self.factored = 0.0  # damping of the matrix that was factorized last
         self.iterations = 0
+        self.chained = False  # converged by steps of a chain
         self.multipliers: np.ndarray | None = None
         self.hessian: np.ndarray | None = None  # at the last linearization
         self.penalty = 0.0
@@ -217,7 +233,7 @@ class _Search:
     def run(self, at_most: int | None = None) -> tuple[Status, str]:
         deadline = time.perf_counter() + self.options.time_limit
         fixed = self.session.settings.iterations
-        limit = fixed or at_most or self.options.iteration_limit or 100
+        limit = fixed or at_most or self.options.iteration_limit or DEFAULT_LIMIT
         tolerance = 0.1 * self.options.tolerance
         while self.iterations < limit:
             if time.perf_counter() > deadline:
@@ -233,6 +249,16 @@ class _Search:
         if fixed is not None:
             return Status.SOLVED, f"{fixed} iteration(s) as asked, convergence not tested"
         return Status.ITERATION_LIMIT, f"not converged after {limit} iterations"
+
+    def follow(self, chain: ChainSteps) -> bool:
+        """Undamped steps as long as they lead down; whether they converged."""
+        limit = (self.options.iteration_limit or DEFAULT_LIMIT) - self.iterations
+        deadline = time.perf_counter() + self.options.time_limit
+        self.chained, steps = chain.run(self.bound, self.point, 0.1 * self.options.tolerance, limit, deadline)
+        self.point, self.iterations = chain.point, self.iterations + steps
+        if self.chained:
+            self.hessian = chain.hessian
+        return self.chained
 
     def feedback(self, hessian: np.ndarray) -> tuple[Status, str]:
         """One full step with the matrix factorized by `GaussNewton.prepare`."""

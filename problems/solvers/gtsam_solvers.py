@@ -14,8 +14,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from problems.errors import FormError
-from problems.forms.factor_graph import FactorGraph, GraphTerm
 from problems.forms.costs import Bound
+from problems.forms.factor_graph import FactorGraph, GraphTerm
 from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.template import template_of
 from problems.noise import L2, GemanMcClure

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from problems.forms.layout import Layout
 from problems.forms.costs import Bound
+from problems.forms.layout import Layout
 from problems.forms.least_squares import Constraints, LeastSquares
 from problems.forms.pins import Pins
 from problems.forms.sparsity import HessianPattern
