@@ -22,8 +22,11 @@ import numpy as np
 from mhe.covariance import SETTLED_TOLERANCE, disturbance_response, riccati_step, symmetrized, window_noise
 from mhe.window import Window
 from problems.errors import SettingError, UnknownNameError
+from problems.forms.affine_marginal import AffineMarginal
 from problems.models import LinearModel, Model
 from problems.networks.observability import observability_matrix
+from problems.solvers.qp_recursion import Following
+from problems.solvers.qp_session import QPSession
 from problems.solvers.session import Session, Solution
 
 Prior = Literal["filter", "seed", "smoothing"]
@@ -109,6 +112,31 @@ class ArrivalCost(ABC):
     def slide(self, now: WindowState) -> dict[str, Any]:
         """Data for the window after its oldest instant left; `now` is the window before."""
 
+    @abstractmethod
+    def settled(self, now: WindowState) -> bool:
+        """Whether the next windows differ in nothing but vectors while no measurement is missing.
+
+        Args:
+            now: a full window of a quadratic session with all its measurements.
+        """
+
+    def following(self, now: WindowState) -> Following:
+        """How `slide` makes reference and linear part of the next window, once settled."""
+        layout = now.session.layout
+        kept = np.concatenate([layout.columns(slot).ravel() for slot in self.window.kept])
+        on_reference, on_data, constant = self._linear(now)
+        s, at = kept.size, np.arange(kept.size)
+        Z, D = np.zeros((2 * s, layout.size)), np.zeros((2 * s, layout.data_size))
+        Z[at, kept] = 1.0
+        Z[s:, kept], D[s:] = on_reference, on_data
+        numbers = np.concatenate([layout.data_start[name] + at for name in ("reference", "linear")])
+        return Following(numbers, Z, D, np.concatenate([np.zeros(s), constant]))
+
+    def _linear(self, now: WindowState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The next linear part by the next reference (s, s) and the data (s, data), and a constant (s,)."""
+        s = self._mean.size
+        return np.zeros((s, s)), np.zeros((s, now.session.layout.data_size)), np.zeros(s)
+
     def _information(self, matrix: np.ndarray) -> dict[str, Any]:
         """`matrix` as data, where it differs from what the session has."""
         if matrix is self._computed:
@@ -140,6 +168,17 @@ class FilterArrival(ArrivalCost):
             "linear": -marginal.vector[None],
             **self._information(marginal.information),
         }
+
+    def settled(self, now: WindowState) -> bool:
+        return self._map(now).M is self._computed
+
+    def _map(self, now: WindowState) -> AffineMarginal:
+        assert isinstance(now.session, QPSession)
+        return now.session.marginal_map(self._drop, self._keep)
+
+    def _linear(self, now: WindowState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        marginal = self._map(now)
+        return marginal.M, marginal.G, marginal.g
 
 
 class SeedArrival(ArrivalCost):
@@ -175,6 +214,9 @@ class SeedArrival(ArrivalCost):
         self._settled = bool(used.all() and change <= SETTLED_TOLERANCE * np.abs(following).max())
         self._current = following
         return data | self._information(inverse(following))
+
+    def settled(self, now: WindowState) -> bool:
+        return self.rule == "constant" or self._settled
 
 
 class SmoothingArrival(ArrivalCost):
@@ -221,6 +263,21 @@ class SmoothingArrival(ArrivalCost):
         if data:
             self._matrices = {}
         return {"reference": reference[None], "linear": (weighted @ deviation)[None], **data}
+
+    def settled(self, now: WindowState) -> bool:
+        matrix = self._matrices.get(np.ones(now.measurements.shape, dtype=bool).tobytes())
+        return matrix is not None and matrix is self._computed
+
+    def _linear(self, now: WindowState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        _, on_data, constant = super()._linear(now)
+        weighted = self._shares[np.ones(now.measurements[1:].size, dtype=bool).tobytes()][0]
+        start = now.session.layout.data_start
+        p, m = now.measurements.shape[1], now.inputs.shape[1]
+        on_data[:, start["y"] + p : start["y"] + now.measurements.size] = weighted
+        if m:
+            pushes = np.kron(np.eye(len(now.inputs) - 2), self.model.B)
+            on_data[:, start["u"] + 2 * m : start["u"] + now.inputs.size] = -weighted @ self._pushed @ pushes
+        return -weighted @ self._free, on_data, constant
 
 
 def arrival_cost(

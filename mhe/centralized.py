@@ -15,12 +15,14 @@ from mhe.arrival import CovarianceRule, GrowthPrior, Prior, WindowState, arrival
 from mhe.estimate import WindowEstimate
 from mhe.observers import check_gain, given_gain, kalman_gain
 from mhe.polyhedron import Polyhedron
+from mhe.settled import SettledWindow
 from mhe.slots import Late, Slots, finite
 from mhe.window import Window, WindowForm
 from problems.errors import DataError, SettingError, ShapeError, UnknownNameError
 from problems.models import LinearModel, Model, observability, require_observable
 from problems.noise import Loss
 from problems.solvers.base import Status
+from problems.solvers.qp_recursion import Recursion, RecursionSolution
 from problems.solvers.session import Session, Solution
 
 Infeasible = Literal["predict", "soft"]
@@ -63,7 +65,6 @@ class MovingHorizonEstimator:
 
     Attributes:
         window: the problem that is solved.
-        session: its session.
         options: all options by name, defaults included.
     """
 
@@ -114,7 +115,7 @@ class MovingHorizonEstimator:
         if iterations is not None and not self._quadratic:
             settings["iterations"] = iterations
         self._compile = {"solver": solver, **settings}
-        self.session: Session = self.window.compile(**self._compile)
+        self._session: Session = self.window.compile(**self._compile)
         self._soft_window: Window | None = None
         if infeasible == "soft" and self.window.bounds:
             self._soft_window = Window(model, horizon, penalty=penalty, **stated)
@@ -125,6 +126,19 @@ class MovingHorizonEstimator:
         self._feedback = iterations == 1 and not self._quadratic
         self._states = [self.window.x[k] for k in range(self.window.horizon + 1)]
         self._slots = Slots(model, self.window.horizon)
+        self._settled = SettledWindow(self.window, self._arrival)
+        self._shape = (model.measurement_size,)
+        # what all estimates of settled steps have in common
+        self._common: dict[str, Any] = {
+            "status": Status.SOLVED,
+            "infeasible": (),
+            "missing": (),
+            "late": (),
+            "too_late": (),
+            "state_names": model.state_names,
+            "parameters": self._given,
+            "_slot": self._states[-1] if gain is None else None,
+        }
         self.options: dict[str, Any] = {
             "disturbance": "process_noise" if gain is None else "pre_estimation",
             "horizon": self.window.horizon,
@@ -141,14 +155,23 @@ class MovingHorizonEstimator:
         }
         self.reset()
 
+    @property
+    def session(self) -> Session:
+        """The window's session, with the data of the last step."""
+        self._pause()
+        return self._session
+
     def reset(self) -> None:
         """Forget everything but the prior: the next step is the first one. Everything compiled stays."""
+        self._recursion: Recursion | None = None
+        self._followed: RecursionSolution | None = None
+        self._regular = False
         n, slots = self.model.state_size, self._slots
-        self.session.reset()
+        self._session.reset()
         slots.clear()
         parameters = self._given if self.window.parameters is None else self._mean[n:].copy()
         states = np.tile(self._mean[:n], (self.window.horizon + 1, 1))
-        self._now = WindowState(states, parameters, slots.measurements, slots.inputs, self.session)
+        self._now = WindowState(states, parameters, slots.measurements, slots.inputs, self._session)
         self._before = states
         self._ready: tuple[np.ndarray, np.ndarray | None] | None = None
         self._data: dict[str, Any] = {"y": slots.column, **self._arrival.start()}
@@ -167,6 +190,8 @@ class MovingHorizonEstimator:
         slots = self._slots
         if not slots.filled or self._ready is not None:
             raise DataError("prepare comes once between two steps")
+        self._pause()
+        self._regular = False
         u = slots.input(inputs)
         self._advance(u)
         guess = None if self._quadratic else self._guess()
@@ -177,7 +202,7 @@ class MovingHorizonEstimator:
         if self._feedback and guess is not None:
             self._linearize(guess)
         else:
-            self.session.update(**self._data)
+            self._session.update(**self._data)
             self._data = {"y": slots.column}
 
     def step(self, measurements: Any, inputs: Any = None, time: float | None = None, late: Late = ()) -> WindowEstimate:
@@ -199,6 +224,11 @@ class MovingHorizonEstimator:
             ShapeError: wrong shapes.
         """
         started = perf_counter()
+        if self._regular and not late:
+            estimate = self._follow(measurements, inputs, time, started)
+            if estimate is not None:
+                return estimate
+        self._pause()
         slots, ready = self._slots, self._ready
         y, missing = slots.measurement(measurements)
         u = ready[0] if ready is not None and inputs is None else slots.input(inputs)
@@ -212,7 +242,7 @@ class MovingHorizonEstimator:
             if amendments and not first and self._arrival.takes_leaving:
                 amendments = slots.amend(amendments, used)
                 # the arrival cost is made from what the session knows
-                self.session.update(y=slots.column)
+                self._session.update(y=slots.column)
             self._advance(u)
         slots.enter(y, instant)
         if amendments:
@@ -223,6 +253,7 @@ class MovingHorizonEstimator:
         else:
             status, solution = self._solve(bool(missing) or bool(used))
             infeasible = () if status in _SOLVED or status in _STOPPED else self._fall_back(status)
+        self._regular = slots.slid and status is Status.SOLVED and self._quadratic
         states, newest = self._now.states, slots.newest
         noisy = status in _SOLVED and solution is not None and self.window.gain is None
         return WindowEstimate(
@@ -244,6 +275,44 @@ class MovingHorizonEstimator:
             }
         )
 
+    def _follow(self, measurements: Any, inputs: Any, time: float | None, started: float) -> WindowEstimate | None:
+        """A step of a settled window; None where it takes the long way, with nothing changed."""
+        recursion, slots = self._recursion, self._slots
+        if recursion is None:
+            recursion = self._recursion = self._settled.recursion(self._now)
+            if recursion is None:
+                self._regular = False
+                return None
+        record = np.asarray(measurements, dtype=float)
+        if record.shape != self._shape:
+            return None
+        if inputs is not None or slots.inputs.size:
+            record = np.concatenate((record, slots.input(inputs)))
+        instant = slots.instant(time)
+        solution = recursion.step(record)
+        if solution is None:
+            return None
+        self._followed = solution
+        slots.times.append(instant)
+        reported = solution.reported.copy()
+        seconds = perf_counter() - started
+        solution.seconds = {"update": 0.0, "solve": seconds}
+        fields = self._common | {"state": reported, "seconds": seconds, "time": instant, "solution": solution}
+        if self.window.parameters is not None:
+            fields["state"], fields["parameters"] = np.split(reported, [self.model.state_size])
+        return WindowEstimate(fields)
+
+    def _pause(self) -> None:
+        """Bring slots, window and session up to date with the settled steps since the last ordinary one."""
+        recursion, self._recursion = self._recursion, None
+        solution, self._followed = self._followed, None
+        if recursion is None or solution is None:
+            return
+        recursion.hand_back(solution.point)
+        self._slots.restore(recursion.records)
+        self._take(solution)
+        self._now.solution = solution
+
     def _advance(self, u: np.ndarray) -> None:
         """Make room for the next instant and bring the arrival cost up to date."""
         slots = self._slots
@@ -263,15 +332,15 @@ class MovingHorizonEstimator:
         data, ready, before = self._data, self._ready, self._now.solution
         self._data, self._ready = {"y": self._slots.column}, None
         if self._quadratic:
-            solution = self.session.solve(data)
+            solution = self._session.solve(data)
         else:
             guess = self._guess() if ready is None or ready[1] is None else ready[1]
             if ready is not None and self._feedback:
                 if irregular:  # the preparation counted on all components, and on earlier ones as they were
                     self._linearize(guess)
-                solution = self.session.solve(data)
+                solution = self._session.solve(data)
             else:
-                solution = self.session.solve(data, self._values(guess))
+                solution = self._session.solve(data, self._values(guess))
         status = solution.status
         stale = solution.iterations == 0 or (before is not None and solution.point is before.point)
         if status in _STOPPED and stale:
@@ -297,8 +366,8 @@ class MovingHorizonEstimator:
             return everything
         if self._soft_session is None:
             self._soft_session = self._soft_window.compile(**self._compile)
-        store = self.session.store
-        inputs = self.session.problem.inputs.items()
+        store = self._session.store
+        inputs = self._session.problem.inputs.items()
         data = {name: store[name] for name, entry in inputs if entry.of is None}
         solution = self._soft_session.solve(data, None if self._quadratic else {"x": self._now.states})
         if solution.status not in _SOLVED:
@@ -307,9 +376,9 @@ class MovingHorizonEstimator:
         return self._soft_window.unmet(solution, self._slots.filled)
 
     def _linearize(self, guess: np.ndarray) -> None:
-        self.session.update(**self._data)
+        self._session.update(**self._data)
         self._data = {"y": self._slots.column}
-        self.session.prepare(self._values(guess))
+        self._session.prepare(self._values(guess))
 
     def _values(self, guess: np.ndarray) -> dict[str, Any]:
         """Values to start from; everything else enters linearly."""

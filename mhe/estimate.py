@@ -10,6 +10,7 @@ import numpy as np
 
 from problems.display import Table
 from problems.errors import UnobservableError
+from problems.lazy import lazy
 from problems.solvers.base import Status
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ class WindowEstimate(Estimate):
     parameters: np.ndarray | None = None
 
     def __init__(self, fields: dict[str, Any]) -> None:
-        # the covariance is worked out on access, so the fields go in directly
+        # window and covariance are worked out on access, so the fields go in directly
         self.__dict__.update(fields)
 
     @property
@@ -112,9 +113,20 @@ class WindowEstimate(Estimate):
             known = self.__dict__["_covariance"] = self.solution.covariance(slot)
         return known
 
+    @lazy
+    def window(self) -> np.ndarray:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """(length, n) states of the window, the newest last."""
+        assert self.solution is not None
+        return self.solution["x"].copy()
+
     def __getstate__(self) -> dict[str, Any]:
         # a solution holds on to compiled code, which does not travel between processes
-        return self.__dict__ | {"_covariance": self.covariance, "_slot": None, "solution": None}
+        return self.__dict__ | {
+            "window": self.window,
+            "_covariance": self.covariance,
+            "_slot": None,
+            "solution": None,
+        }
 
 
 @runtime_checkable

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
@@ -33,7 +34,7 @@ class Slots:
         self.measurements = np.empty((self._count, model.measurement_size))
         self.column = self.measurements.reshape(-1, 1)  # the same numbers, shaped as the window's data
         self.inputs = np.empty((self._count, model.input_size))
-        self.times: list[float] = []
+        self.times: deque[float] = deque(maxlen=self._count)
         self.clear()
 
     def clear(self) -> None:
@@ -72,8 +73,11 @@ class Slots:
     def enter(self, y: np.ndarray, time: float) -> None:
         """Write the newest measurement."""
         self.times.append(time)
-        del self.times[: -self.filled]
         self.measurements[self.newest] = y
+
+    def restore(self, records: np.ndarray) -> None:
+        """Take over rows [y, u] of all slots."""
+        self.measurements[:], self.inputs[:] = np.hsplit(records, [self.measurements.shape[1]])
 
     def amend(self, amendments: Amendments, used: list[float]) -> Amendments:
         """Write late measurements into their slots and their times into `used`; returns those of no slot."""

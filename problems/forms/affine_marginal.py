@@ -28,7 +28,12 @@ class AffineMarginalPlan:
 
 
 class AffineMarginal:
-    """``M`` and ``gradient = G d + g`` at zero for one set of weights, matrices and missing data."""
+    """``M`` and ``gradient = G d + g`` at zero for one set of weights, matrices and missing data.
+
+    Attributes:
+        M: (k, k) information on the kept coordinates.
+        G, g: (k, data) and (k,).
+    """
 
     def __init__(self, plan: AffineMarginalPlan, store: DataStore, numbers: np.ndarray, pattern: bytes) -> None:
         program, self._plan = plan.program, plan.plan
@@ -38,13 +43,13 @@ class AffineMarginal:
         gradient = np.column_stack([Q, q0])[order]
         E = np.column_stack([reduced.E, reduced.c])
         self.M, linear = schur(P[order[:, None], order], gradient, reduced.A[:, order], E, self._plan.drop)
-        self._G, self._g = np.ascontiguousarray(linear[:, :-1]), linear[:, -1].copy()
+        self.G, self.g = np.ascontiguousarray(linear[:, :-1]), linear[:, -1].copy()
 
     def __call__(self, numbers: np.ndarray, point: np.ndarray) -> Marginal:
         reference = self._plan.references(point)
         x = np.concatenate([part.ravel() for part in reference])
-        vector = self._G.dot(numbers)
+        vector = self.G.dot(numbers)
         vector += self.M.dot(x)
-        vector += self._g
+        vector += self.g
         np.negative(vector, out=vector)
         return Marginal(tuple(self._plan.slots), self.M, vector, reference)

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse.linalg as spla
-from scipy.linalg.lapack import dpotrf, dpotrs  # type: ignore[attr-defined]
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs  # type: ignore[attr-defined]
 
 from problems.errors import UnobservableError
+from problems.forms.affine import Bounds
 from problems.forms.layout import DataStore
 from problems.forms.quadratic import QuadraticProgram, Reduced
 from problems.solvers.linear import FREE, factorized_kkt
@@ -72,9 +73,58 @@ class DenseMap:
         """T and t."""
         return self._tables[0], self._tables[1]
 
+    @property
+    def linear(self) -> bool:
+        """Whether answers are T d + t."""
+        return self.definite and self.exact
+
+    @property
+    def excesses(self) -> tuple[np.ndarray, np.ndarray]:
+        """The rows of T and t that are excesses over bounds."""
+        T, t = self.table
+        return T[self.size :], t[self.size :]
+
+    def affine(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """T and t of ``wanted z`` (rows, n)."""
+        T, t = self.table
+        return wanted @ T[: self.size], wanted @ t[: self.size]
+
+    @cached_property
+    def _sides(self) -> list[tuple[float, Bounds, np.ndarray]]:
+        """Sign, bounds and inequality rows of both sides' excesses, in their order."""
+        if not self.reduced.bounded:
+            return []
+        off = self.reduced.off_rows(self.flags)
+        sides = ((1.0, self.reduced.upper), (-1.0, self.reduced.lower))
+        return [(sign, bound, bound.used if off is None else bound.used & ~off) for sign, bound in sides]
+
+    @cached_property
+    def _spread(self) -> np.ndarray:
+        """(n + excesses, k) how answer and excesses move with the unknowns that equalities leave."""
+        reduced = self.reduced
+        N = np.eye(reduced.size) if reduced.inner is None else reduced.inner.Z
+        held = reduced.A[reduced.equalities :] @ N
+        return np.vstack([reduced.map.Z @ N, *(sign * held[used] for sign, _, used in self._sides)])
+
+    @cached_property
+    def lift(self) -> np.ndarray:
+        """(n + excesses, k) the same with whitened steps: s costs ``1/2 |s|^2``."""
+        if self._factor is None:  # nothing is left to choose
+            return self._spread
+        return np.ascontiguousarray(dtrtrs(self._factor, self._spread.T, lower=1)[0].T)
+
+    def by_row(self, multipliers: np.ndarray) -> np.ndarray:
+        """Multipliers of the inequality rows, positive at upper bounds, from those of the excesses."""
+        out, start = np.zeros(len(self.reduced.A) - self.reduced.equalities), 0
+        for sign, _, used in self._sides:
+            stop = start + np.count_nonzero(used)
+            out[used] += sign * multipliers[start:stop]
+            start = stop
+        return out
+
     @cached_property
     def _tables(self) -> tuple[np.ndarray, np.ndarray, _Refinement | None]:
-        reduced, flags, factor = self.reduced, self.flags, self._factor
+        reduced, factor = self.reduced, self._factor
         inner, outer = reduced.inner, reduced.map
         right = np.column_stack(self._linear)
         K = right if factor is None else dpotrs(factor, right, lower=1)[0]
@@ -83,13 +133,9 @@ class DenseMap:
             V, v = inner.Z @ V + inner.Y, inner.Z @ v + inner.z0
         blocks, constants = [outer.Z @ V + outer.Y], [outer.Z @ v + outer.z0]
         m = reduced.equalities
-        signs = []
         if reduced.bounded:
             G, g = reduced.A[m:] @ V + reduced.E[m:], reduced.A[m:] @ v + reduced.c[m:]
-            off = reduced.off_rows(flags)
-            for bound, sign in ((reduced.upper, 1.0), (reduced.lower, -1.0)):
-                used = bound.used if off is None else bound.used & ~off
-                signs.append((sign, used))
+            for sign, bound, used in self._sides:
                 rows, constant = sign * G[used], sign * (g[used] - bound.constant[used])
                 index = bound.index[used]
                 by_data = np.flatnonzero(index >= 0)
@@ -99,20 +145,21 @@ class DenseMap:
         refine = None
         if self._gradient is not None and factor is not None:
             N = np.eye(len(factor)) if inner is None else inner.Z
-            lift = [outer.Z @ N]
-            if reduced.bounded:
-                held = reduced.A[m:] @ N
-                lift += [sign * held[used] for sign, used in signs]
-            refine = _Refinement(self._gradient, V, v, N, factor, np.vstack(lift))
+            refine = _Refinement(self._gradient, V, v, N, factor, self._spread)
         return np.ascontiguousarray(np.vstack(blocks)), np.concatenate(constants), refine
 
-    def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """All unknowns (n,) and the violations of all bounds (<= 0 where they hold)."""
+    def outputs(self, numbers: np.ndarray) -> np.ndarray:
+        """All unknowns (n,), then the excesses over all bounds (<= 0 where they hold)."""
         T, t, refine = self._tables
         out = T.dot(numbers)  # half the overhead of the operator
         out += t
         if refine is not None:
             out += refine(numbers)
+        return out
+
+    def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same, apart."""
+        out = self.outputs(numbers)
         return out[: self.size], out[self.size :]
 
     def once(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -209,6 +256,8 @@ def _unseen(flat: np.ndarray, linear: np.ndarray) -> np.ndarray:
 class SparseMap:
     """The same through a sparse factorization of the KKT system, for large problems."""
 
+    exact = False  # nothing is T d + t, as there is no T
+
     def __init__(
         self, program: QuadraticProgram, reduced: Reduced, store: DataStore, flags: dict[str, Any], pattern: bytes
     ) -> None:
@@ -243,6 +292,26 @@ class SparseMap:
         return z, np.concatenate([rows - u[m:], l[m:] - rows])
 
     once = __call__
+
+    @property
+    def linear(self) -> bool:
+        """Whether answers are affine in the numbers."""
+        return self.definite and self._gradient is None
+
+    @property
+    def excesses(self) -> tuple[np.ndarray, np.ndarray]:
+        """T and t of the excesses over bounds: none, as they would be large matrices."""
+        assert not self.reduced.bounded
+        return np.zeros((0, self.Q.shape[1])), np.zeros(0)
+
+    def affine(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """T and t of ``wanted z`` (rows, n), by one solve with a column for each of the rows."""
+        reduced, m = self.reduced, self.reduced.equalities
+        by_v = reduced.map.Z.T @ wanted.T
+        by_row = -self._solve(np.vstack([by_v, np.zeros((m, len(wanted)))]))
+        on_q, on_shift = by_row[: reduced.size].T, by_row[reduced.size :].T
+        T = on_q @ self.Q + on_shift @ reduced.E[:m] + wanted @ reduced.map.Y
+        return T, on_q @ self.q0 + on_shift @ reduced.c[:m] + wanted @ reduced.map.z0
 
     def many(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same for many rows of numbers."""

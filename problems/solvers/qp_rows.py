@@ -127,12 +127,16 @@ class StackedRows:
         Residuals of that answer are affine in the data themselves, zero but for rounding; how far from it is worked
         out once for each map, the rounding of the product that gave the answer included.
         """
-        if self._certificate is None:
-            self._certificate = self._certify(map_)
         size = np.abs(d)
-        (dual, dual_constant), (primal, primal_constant) = self._certificate
+        (dual, dual_constant), (primal, primal_constant) = self.certificate(map_)
         equal = float(primal.dot(size)) + primal_constant if self.equalities else 0.0
         return {"primal": max(equal, violation, 0.0), "dual": float(dual.dot(size)) + dual_constant, "gap": 0.0}
+
+    def certificate(self, map_: DenseMap) -> tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]:
+        """Weights of the sizes of all data, and a constant, that bound the dual and the primal residual."""
+        if self._certificate is None:
+            self._certificate = self._certify(map_)
+        return self._certificate
 
     def _certify(self, map_: DenseMap) -> tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]:
         n = map_.size

@@ -19,7 +19,9 @@ from problems.problem import DataSlot
 from problems.solvers.base import Options, QPBackend, QPResult, Status
 from problems.solvers.batch import QPBatch
 from problems.solvers.qp_check import judge
+from problems.solvers.qp_daqp import DAQP
 from problems.solvers.qp_maps import DenseMap, SparseMap, require_observable
+from problems.solvers.qp_projection import Projection
 from problems.solvers.qp_solution import QPCheck
 from problems.solvers.session import Session, Solution, slot_key
 
@@ -47,6 +49,7 @@ class QPSession(Session):
 
     Attributes:
         slow: names of weight and matrix data, whose change makes new maps.
+        projects: where the affine answer violates a row, its projection is tried before the backend.
         switching: names of data that are nothing but flags, which are part of the pattern.
     """
 
@@ -82,6 +85,9 @@ class QPSession(Session):
         self._backend: QPBackend | None = None
         self._loaded: DenseMap | SparseMap | None = None
         self.last: tuple[np.ndarray, np.ndarray] | None = None
+        # settings of the user's own are for the backend itself
+        self.projects = screen and backend is DAQP and not options.extra
+        self._projection: tuple[DenseMap, Projection] | None = None
         self._check_without_data()
 
     def _check_without_data(self) -> None:
@@ -181,14 +187,41 @@ class QPSession(Session):
                 by_map = None if once else violation
                 check = QPCheck(self.program, self.store, numbers.copy(), map_, z, None, by_map)
                 return Solution(self.layout, z, Status.SOLVED, "linear", check)
+            if not once and self.projects and map_.exact:
+                solution = self._projected(map_, numbers, z, excess)
+                if solution is not None:
+                    return solution
         return self._solve_qp(map_, numbers)
+
+    def _projected(self, map_: Any, numbers: np.ndarray, z: np.ndarray, excess: np.ndarray) -> Solution | None:
+        """The optimum from the affine answer, or None where the backend must say what is wrong."""
+        if self._projection is None or self._projection[0] is not map_:
+            self._projection = map_, self.projection(map_.lift, slice(map_.size, None))
+        found = self._projection[1](np.concatenate((z, excess)))
+        if found is None:
+            return None
+        outputs, multipliers, iterations = found
+        z = outputs[: map_.size]
+        check = _check(self, numbers, map_, z, map_.by_row(multipliers))
+        return Solution(self.layout, z, Status.SOLVED, self.solver, check, iterations)
+
+    def projection(self, lift: np.ndarray, excess: slice) -> Projection:
+        """A `Projection` by the options of this session."""
+        return Projection(lift, excess, self.options, self.warm)
 
     def _marginal(self, drop: Any, keep: Any, point: np.ndarray) -> Marginal:
         """Affine in the data, so the map is kept beside the solution's and costs one product."""
         pattern, numbers = self._pattern()
+        return self._marginal_map(drop, keep, pattern, numbers)(numbers, point)
+
+    def marginal_map(self, drop: Any, keep: Any) -> AffineMarginal:
+        """The marginal as a function of the data, for weights, matrices and pattern as they are."""
+        return self._marginal_map(drop, keep, *self._pattern())
+
+    def _marginal_map(self, drop: Any, keep: Any, pattern: bytes, numbers: np.ndarray) -> AffineMarginal:
         last = self._last_marginal
         if last is not None and last[1] is drop and last[2] is keep and last[0] == pattern:
-            return last[3](numbers, point)
+            return last[3]
         key = (pattern, slot_key(drop), slot_key(keep))
         marginals = self._works_now().marginals
         found = marginals.get(key)
@@ -198,7 +231,7 @@ class QPSession(Session):
             plan = self._plan(drop, keep, AffineMarginalPlan)
             found = marginals[key] = AffineMarginal(plan, self.store, numbers, pattern)
         self._last_marginal = (pattern, drop, keep, found)
-        return found(numbers, point)
+        return found
 
     def batch(self, count: int) -> QPBatch:
         return QPBatch(self, count)
@@ -274,12 +307,12 @@ class QPSession(Session):
 
     def reset(self) -> None:
         super().reset()
-        self.last = self._backend = self._loaded = None
+        self.last = self._backend = self._loaded = self._projection = None
         self._seen, self._now, self._last_marginal = set(), None, None
 
     def _forked(self) -> None:
         self._seen = set(self._seen)
-        self._backend = self._loaded = None
+        self._backend = self._loaded = self._projection = None
 
 
 def _check(

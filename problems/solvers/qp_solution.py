@@ -60,7 +60,8 @@ class QPCheck:
         self._found: tuple[np.ndarray, tuple[float, float, float]] | None = None
 
     @property
-    def _rows(self) -> StackedRows:
+    def rows(self) -> StackedRows:
+        """Stacked rows of the pattern and weights."""
         rows = self._map.rows
         if rows is None:
             rows = self._map.rows = StackedRows(self._program, self._store.copy(self._numbers), self._map.flags)
@@ -69,7 +70,7 @@ class QPCheck:
     def _optimality(self) -> tuple[np.ndarray, tuple[float, float, float]]:
         """Multipliers of the equalities; ``primal``, ``dual`` and the absolute gap."""
         if self._found is None:
-            rows = self._rows
+            rows = self.rows
             values = rows.values(self._z, self._mu, self._numbers)
             multipliers = rows.equality_multipliers(values)
             self._found = multipliers, rows.residuals(values, self._mu, multipliers)
@@ -81,18 +82,18 @@ class QPCheck:
         return primal <= tolerance and dual <= tolerance and gap <= tolerance
 
     def objective(self) -> float:
-        return self._rows.objective(self._z, self._numbers)
+        return self.rows.objective(self._z, self._numbers)
 
     def residuals(self) -> dict[str, float]:
         if self._violation is not None and isinstance(self._map, DenseMap) and self._map.exact:
-            return self._rows.certified(self._map, self._numbers, self._violation)
+            return self.rows.certified(self._map, self._numbers, self._violation)
         primal, dual, gap = self._optimality()[1]
         if gap > NEGLIGIBLE:
             gap /= max(1.0, abs(self.objective()))
         return {"primal": primal, "dual": dual, "gap": gap}
 
     def multipliers(self) -> dict[str, np.ndarray]:
-        rows = self._rows
+        rows = self.rows
         if self._mu is None and not rows.equalities:
             return {name: np.zeros(shape) for name, _, shape in rows.inequalities}
         held = self._optimality()[0]
@@ -102,9 +103,9 @@ class QPCheck:
         return out
 
     def active_set(self) -> dict[str, np.ndarray]:
-        rows = self._rows
+        rows = self.rows
         active = rows.active(self._z, self._numbers, self._mu)
         return {name: active[part].reshape(shape) for name, part, shape in rows.inequalities}
 
     def covariance(self, slots: tuple[Any, ...]) -> np.ndarray:
-        return self._rows.covariance(columns_of(self._program.layout, slots))
+        return self.rows.covariance(columns_of(self._program.layout, slots))

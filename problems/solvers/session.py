@@ -14,6 +14,7 @@ import numpy as np
 
 from problems.errors import DataError, FormError, UnknownNameError
 from problems.forms.layout import DataStore, Layout
+from problems.lazy import lazy
 from problems.problem import Slot
 from problems.solvers.base import Options, Status
 
@@ -66,11 +67,6 @@ class Solution:
         self.iterations = iterations
         self.message = message
         self.seconds: dict[str, float] = {}
-        # not `cached_property`, whose lock costs as much as what is kept
-        self._objective: float | None = None
-        self._residuals: dict[str, float] | None = None
-        self._multipliers: dict[str, np.ndarray] | None = None
-        self._active_set: dict[str, np.ndarray] | None = None
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self._layout.value(self.point, name)
@@ -84,32 +80,24 @@ class Solution:
     def solved(self) -> bool:
         return self.status is Status.SOLVED
 
-    @property
+    @lazy
     def objective(self) -> float:
-        if self._objective is None:
-            self._objective = self._check.objective()
-        return self._objective
+        return self._check.objective()
 
-    @property
+    @lazy
     def residuals(self) -> dict[str, float]:
         """``primal``, ``dual`` and ``gap``, recomputed here from the problem and the point."""
-        if self._residuals is None:
-            self._residuals = self._check.residuals()
-        return self._residuals
+        return self._check.residuals()
 
-    @property
+    @lazy
     def multipliers(self) -> dict[str, np.ndarray]:
         """(count, dim) multipliers of every equality and inequality term; positive at an upper bound."""
-        if self._multipliers is None:
-            self._multipliers = self._check.multipliers()
-        return self._multipliers
+        return self._check.multipliers()
 
-    @property
+    @lazy
     def active_set(self) -> dict[str, np.ndarray]:
         """(count, dim) of every inequality: 1 at the upper bound, -1 at the lower, 0 between."""
-        if self._active_set is None:
-            self._active_set = self._check.active_set()
-        return self._active_set
+        return self._check.active_set()
 
     def covariance(self, *slots: Variable | Slot | str) -> np.ndarray:
         """Joint covariance of the slots at the solution, in tangent coordinates (body frame), slot after slot.
