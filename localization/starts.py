@@ -163,7 +163,9 @@ def _chained(graph: PoseGraph, space: Space, roots: dict[int, np.ndarray]) -> tu
     before = parent[moving]
     edge = row[np.searchsorted(pair, np.minimum(moving, before) * count + np.maximum(moving, before))]
     step = space.normalize_array(edges.value[edge])
-    poses[moving] = np.where((edges.first[edge] == before)[:, None], step, _inverse(space, step))
+    back = edges.first[edge] != before
+    step[back] = _inverse(space, step[back])
+    poses[moving] = step
     poses = _composed(space, poses, parent)
     return (poses, ()) if parts == 1 else join(graph, poses, part, known)
 

@@ -177,6 +177,7 @@ class Layout:
         self.flat = all(isinstance(variable.space, Vector) for variable in problem.unknowns.values())
         self.block_dims = np.concatenate(dims) if dims else np.zeros(0, int)
         self.block_columns = np.concatenate([[0], np.cumsum(self.block_dims)]).astype(np.intp)
+        self._alike = all(v.space.ambient == v.space.dim for v in problem.unknowns.values())
         self.data_start: dict[str, int] = {}
         numbers = 0
         for entry in problem.inputs.values():
@@ -219,12 +220,15 @@ class Layout:
         def rows(parts: list[np.ndarray]) -> np.ndarray:
             if not parts:
                 return np.zeros((term.count, 0), np.intp)
+            if len(parts) == 1 and len(parts[0]) == term.count:
+                return parts[0]
             return np.hstack([np.broadcast_to(p, (term.count, p.shape[1])) for p in parts])
 
+        stored = rows([self.stored(s) for s in term.slots])
         return TermLayout(
             term,
-            rows([self.stored(s) for s in term.slots]),
-            rows([self.columns(s) for s in term.slots]),
+            stored,
+            stored if self._alike else rows([self.columns(s) for s in term.slots]),
             rows([self.block_start[s.source.name] + s.indices[:, None] for s in term.slots]),
             rows([self.numbers(s) for s in term.data]),
             self.numbers(term.linear) if isinstance(term.linear, DataSlot) else None,
@@ -350,27 +354,33 @@ class Activity:
     """Which instances of costs and inequalities are switched on: no NaN among the data they read, `active` not 0."""
 
     def __init__(self, layout: Layout) -> None:
-        self._terms: list[tuple[TermLayout, np.ndarray, np.ndarray | None]] = []
+        self._layout = layout
+        self._terms: list[tuple[TermLayout, np.ndarray | None]] = []
         for entry in layout.terms:
-            term = entry.term
-            flagged = {s.source.of.name for s in term.data if s.source.of is not None}
-            reads = [layout.numbers(s) for s in term.data if s.source.of is None and s.source.name not in flagged]
-            reads += [layout.numbers(v) for v in (term.linear, term.lower, term.upper) if isinstance(v, DataSlot)]
-            index = np.hstack(
-                [np.zeros((term.count, 0), np.intp), *(np.broadcast_to(r, (term.count, r.shape[1])) for r in reads)]
-            )
             switch = None
-            if isinstance(term.active, DataSlot):
-                switch = np.broadcast_to(layout.numbers(term.active), (term.count, 1))[:, 0]
-            self._terms.append((entry, index, switch))
-        # weights and flags are checked where they are used, so a NaN there is an error and not a pattern
-        self.switches = np.unique(np.concatenate([s for _, _, s in self._terms if s is not None] or [np.zeros(0, int)]))
+            if isinstance(entry.term.active, DataSlot):
+                switch = np.broadcast_to(layout.numbers(entry.term.active), (entry.term.count, 1))[:, 0]
+            self._terms.append((entry, switch))
+        self.switches = np.unique(np.concatenate([s for _, s in self._terms if s is not None] or [np.zeros(0, int)]))
         self.constant = [
             None
             if term.term.active is None or isinstance(term.term.active, DataSlot)
             else constant_rows(term.term.active, 1, term.term.count, f"{term.term.what}: active")[:, 0] != 0
-            for term, _, _ in self._terms
+            for term, _ in self._terms
         ]
+
+    @cached_property
+    def _reads(self) -> list[np.ndarray]:
+        """(count, numbers) positions of the data each term reads; found where some are missing."""
+        found = []
+        for term in (entry.term for entry, _ in self._terms):
+            # weights and flags are checked where they are used, so a NaN there is an error and not a pattern
+            flagged = {s.source.of.name for s in term.data if s.source.of is not None}
+            slots = [s for s in term.data if s.source.of is None and s.source.name not in flagged]
+            slots += [v for v in (term.linear, term.lower, term.upper) if isinstance(v, DataSlot)]
+            parts = [np.zeros((term.count, 0), np.intp), *map(self._layout.numbers, slots)]
+            found.append(np.hstack([np.broadcast_to(part, (term.count, part.shape[1])) for part in parts]))
+        return found
 
     def key(self, numbers: np.ndarray, finite: bool = False) -> bytes:
         """Identifies the pattern; equal keys give equal `flags`. `finite` numbers are not searched for NaN."""
@@ -386,8 +396,13 @@ class Activity:
         """
         out: list[np.ndarray | None] = []
         missing = np.isnan(numbers)
-        for (entry, index, switch), constant in zip(self._terms, self.constant, strict=True):
-            on: Any = ~missing[..., index].any(axis=-1)
+        complete = not missing.any()
+        for k, ((entry, switch), constant) in enumerate(zip(self._terms, self.constant, strict=True)):
+            on: Any = (
+                np.ones((*numbers.shape[:-1], entry.term.count), bool)
+                if complete
+                else ~missing[..., self._reads[k]].any(axis=-1)
+            )
             if entry.term.kind == "equality":
                 if not on.all():
                     raise DataError(

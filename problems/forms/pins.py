@@ -35,7 +35,7 @@ class Pins:
                 self.columns = columns
         self.columns = np.sort(self.columns)
         self.names = frozenset(e.term.name for e in self._terms)
-        self._mask: np.ndarray | None = None
+        self._entries: np.ndarray | None = None
 
     def apply(self, point: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """The point with every fixed instance on its value, by Newton on the equality; `violation` tells success."""
@@ -67,13 +67,12 @@ class Pins:
         """Make rows and columns of fixed coordinates those of the identity (in place), so that their step is zero."""
         if not self.columns.size:
             return
-        if self._mask is None:
+        if self._entries is None:
             fixed = np.zeros(pattern.size, bool)
             fixed[self.columns] = True
-            column = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-            self._mask = fixed[column] | fixed[pattern.indices]
+            self._entries = np.flatnonzero(fixed[pattern.columns] | fixed[pattern.indices])
         gradient[self.columns] = 0.0
-        hessian[self._mask] = 0.0
+        hessian[self._entries] = 0.0
         hessian[pattern.diagonal[self.columns]] = 1.0
 
 

@@ -58,6 +58,11 @@ class HessianPattern:
     def nonzeros(self) -> int:
         return int(self.indptr[-1])
 
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Column of every entry."""
+        return np.repeat(np.arange(self.size), np.diff(self.indptr))
+
     @property
     def bandwidth(self) -> int:
         """Entries above the diagonal in the longest column, zeros between them included."""

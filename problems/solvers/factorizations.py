@@ -56,9 +56,8 @@ class DenseCholesky:
 
     def __init__(self, pattern: HessianPattern) -> None:
         self._matrix = np.zeros((pattern.size, pattern.size))
-        columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         # transposed view: LAPACK reads columns, so the lower triangle of the row-major array is its upper one
-        self._flat = columns * pattern.size + pattern.indices
+        self._flat = pattern.columns * pattern.size + pattern.indices
         self._factor: Any = None
 
     def factor(self, values: np.ndarray) -> None:
@@ -84,8 +83,7 @@ class BandedCholesky:
     name: ClassVar[str] = "banded"
 
     def __init__(self, pattern: HessianPattern) -> None:
-        columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-        self.width = pattern.bandwidth
+        columns, self.width = pattern.columns, pattern.bandwidth
         self.places = columns * (self.width + 1) + self.width + pattern.indices - columns
         self._band = np.zeros((self.width + 1) * pattern.size)
         # its transpose is what LAPACK reads by columns
@@ -170,7 +168,7 @@ class SuperLU:
         place = np.empty(n, np.intp)
         place[order] = np.arange(n)
         rows = place[pattern.indices]
-        columns = place[np.repeat(np.arange(n), np.diff(pattern.indptr))]
+        columns = place[pattern.columns]
         off = np.flatnonzero(rows != columns)
         entries = np.concatenate([np.arange(rows.size), off]) + 1.0
         ends = (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]]))
@@ -226,8 +224,8 @@ class CHOLMOD:
         except ModuleNotFoundError as error:
             raise MissingExtraError("linear solver cholmod", "cvxopt", "gpl") from error
         self._pattern = pattern
-        columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-        self._matrix = cvxopt.spmatrix(1.0, pattern.indices.tolist(), columns.tolist(), (pattern.size, pattern.size))
+        ends = (pattern.indices.tolist(), pattern.columns.tolist())
+        self._matrix = cvxopt.spmatrix(1.0, *ends, (pattern.size, pattern.size))
         self._factor: Any = None
 
     def factor(self, values: np.ndarray) -> None:

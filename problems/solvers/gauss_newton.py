@@ -88,7 +88,6 @@ class GaussNewton(Session):
         self.pins = Pins(layout)
         self.constraints = Constraints(layout, self.pins.names)
         pattern = self.form_.pattern
-        self.hessian_columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         self._linear = factorization(pattern, self.settings.linear_solver)
         self.sparse = pattern.size > DENSE_SIZE and self._linear.name != "banded"
         self._chain = self._chain_steps()
@@ -123,8 +122,16 @@ class GaussNewton(Session):
         self._renew()
 
     def _renew(self) -> None:
-        self._step = QPStep(self.form_.pattern, self.constraints, self.pins, self.options, self.settings.qp_solver)
+        self._made_step: QPStep | None = None
         self._prepared: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def qp_step(self) -> QPStep:
+        """The QP of a step, made where constraints or settings ask for it."""
+        if self._made_step is None:
+            settings = self.settings
+            self._made_step = QPStep(self.form_.pattern, self.constraints, self.pins, self.options, settings.qp_solver)
+        return self._made_step
 
     def prepare(self, initial: Mapping[str, Any] | None = None) -> None:
         """Linearize and factorize at `initial` with the data given so far; the next solve is one feedback step.
@@ -389,7 +396,9 @@ class _Search:
             self.multipliers = np.zeros(constraints.size)
             self.doubtful = False
             return None, step
-        result, status = self.session._step.solve(hessian, gradient, entries, self.lower - values, self.upper - values)
+        result, status = self.session.qp_step.solve(
+            hessian, gradient, entries, self.lower - values, self.upper - values
+        )
         # a backend that stops at its limit is mostly close: the step is taken, and our own test decides at the end
         usable = status in (Status.SOLVED, Status.INACCURATE, Status.ITERATION_LIMIT)
         if result.x is None or result.y is None or not usable:
@@ -400,7 +409,7 @@ class _Search:
 
     def _curvature(self, hessian: np.ndarray, step: np.ndarray) -> float:
         pattern = self.session.form_.pattern
-        products = hessian * step[self.session.hessian_columns] * step[pattern.indices]
+        products = hessian * step[pattern.columns] * step[pattern.indices]
         return float(2 * products.sum() - products[self.diagonal].sum())
 
     def _violation(self, point: np.ndarray) -> tuple[float, float]:

@@ -138,8 +138,7 @@ def gauge_freedom(
         if attempt == 0 and size < (DAMPED_GROWTH if damped else GROWTH) * before:
             return ""
         direction /= size
-    columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-    products = hessian * direction[columns] * direction[pattern.indices]
+    products = hessian * direction[pattern.columns] * direction[pattern.indices]
     if abs(float(2 * products.sum() - products[pattern.diagonal].sum())) > LOOSE:
         return ""
     return (

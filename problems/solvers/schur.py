@@ -29,7 +29,7 @@ class SchurComplement:
         self._rest, self._gone = np.flatnonzero(~inside), np.flatnonzero(inside)
         place = np.empty(pattern.size, np.intp)
         place[self._rest], place[self._gone] = np.arange(self._rest.size), np.arange(self._gone.size)
-        rows, columns = pattern.indices, np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+        rows, columns = pattern.indices, pattern.columns
         kept = ~inside[rows] & ~inside[columns]
         self._a = (np.flatnonzero(kept), place[rows[kept]], place[columns[kept]])
         mixed = np.flatnonzero(inside[rows] ^ inside[columns])
