@@ -11,6 +11,7 @@ import ctypes
 import math
 import time
 from functools import cache
+from importlib import import_module
 
 import numpy as np
 
@@ -188,9 +189,7 @@ def _code() -> Code:
 @cache
 def _lapack(name: str) -> int:
     """Address of a LAPACK routine, as SciPy offers it to compiled code."""
-    from scipy.linalg import cython_lapack
-
-    capsule = cython_lapack.__pyx_capi__[name]
+    capsule = import_module("scipy.linalg.cython_lapack").__pyx_capi__[name]
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
