@@ -70,7 +70,8 @@ class Pins:
         if self._entries is None:
             fixed = np.zeros(pattern.size, bool)
             fixed[self.columns] = True
-            self._entries = np.flatnonzero(fixed[pattern.columns] | fixed[pattern.indices])
+            own = [np.arange(pattern.indptr[c], pattern.indptr[c + 1]) for c in self.columns]
+            self._entries = np.concatenate([np.flatnonzero(fixed[pattern.indices]), *own])
         gradient[self.columns] = 0.0
         hessian[self._entries] = 0.0
         hessian[pattern.diagonal[self.columns]] = 1.0

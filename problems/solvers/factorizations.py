@@ -109,8 +109,10 @@ class SparseLDL:
     name: ClassVar[str] = "qdldl"
 
     def __init__(self, pattern: HessianPattern) -> None:
-        self._pattern, shape = pattern, (pattern.size, pattern.size)
-        self._matrix = sp.csc_matrix((np.ones(pattern.nonzeros), pattern.indices, pattern.indptr), shape=shape)
+        self._pattern = pattern
+        self._matrix = sp.csc_matrix((pattern.size, pattern.size))
+        # set one by one: what the constructor checks is known to hold, and takes it a tenth of a factorization
+        self._matrix.indices, self._matrix.indptr = pattern.indices, pattern.indptr
         self._solver: Any = None
 
     def factor(self, values: np.ndarray) -> None:
