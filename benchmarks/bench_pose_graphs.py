@@ -28,10 +28,10 @@ gtsam = pytest.importorskip("gtsam")
 
 # optimum, repetitions, and by linear solver gtsam's time over ours, at least: with default and with tight tolerances
 CASES: dict[str, tuple[float, int, dict[str, tuple[float, float]]]] = {
-    "intel": (22.502117, 15, {"auto": (2.6, 3.0)}),
-    "kitti_05": (78.551925, 15, {"auto": (3.3, 3.3)}),
-    "manhattan": (1774.520535, 9, {"auto": (2.6, 3.0)}),
-    "tinyGrid3D": (9.313909, 15, {"auto": (0.2, 0.25)}),  # 9 poses: what is timed is how Python starts
+    "intel": (22.502117, 15, {"auto": (3.3, 3.8)}),
+    "kitti_05": (78.551925, 15, {"auto": (4.6, 4.6)}),
+    "manhattan": (1774.520535, 9, {"auto": (3.4, 3.8)}),
+    "tinyGrid3D": (9.313909, 15, {"auto": (0.28, 0.28)}),  # 9 poses: what is timed is how Python starts
     "sphere2500": (
         675.700963,
         5,
