@@ -284,9 +284,9 @@ class MovingHorizonEstimator:
                 self._regular = False
                 return None
         record = np.asarray(measurements, dtype=float)
-        if record.shape != self._shape:
+        if record.shape != self._shape or not record.dot(record) < np.inf:
             return None
-        if inputs is not None or slots.inputs.size:
+        if inputs is not None or self.model.input_size:
             record = np.concatenate((record, slots.input(inputs)))
         instant = slots.instant(time)
         solution = recursion.step(record)
@@ -295,8 +295,7 @@ class MovingHorizonEstimator:
         self._followed = solution
         slots.times.append(instant)
         reported = solution.reported.copy()
-        seconds = perf_counter() - started
-        solution.seconds = {"update": 0.0, "solve": seconds}
+        seconds = solution.spent = perf_counter() - started
         fields = self._common | {"state": reported, "seconds": seconds, "time": instant, "solution": solution}
         if self.window.parameters is not None:
             fields["state"], fields["parameters"] = np.split(reported, [self.model.state_size])

@@ -117,9 +117,10 @@ class Slots:
 
     def instant(self, time: float | None) -> float:
         """Time of the next instant, counted on if None. Raises DataError where it does not advance."""
-        last = self.times[-1] if self.times else None
+        times = self.times
         if time is None:
-            return 0.0 if last is None else last + self._period
+            return times[-1] + self._period if times else 0.0
+        last = times[-1] if times else None
         if not np.isfinite(time) or (last is not None and time <= last):
             raise DataError(f"time: expected a number later than the last step's {last}, got {time!r}")
         return float(time)

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar, overload
 T = TypeVar("T")
 
 
-class lazy(Generic[T]):
+class lazy(Generic[T]):  # noqa: N801
     """As `functools.cached_property`, without the lock that costs a microsecond at every first read in Python 3.11.
 
     A value given to the attribute takes its place.

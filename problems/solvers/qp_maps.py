@@ -113,14 +113,20 @@ class DenseMap:
             return self._spread
         return np.ascontiguousarray(dtrtrs(self._factor, self._spread.T, lower=1)[0].T)
 
-    def by_row(self, multipliers: np.ndarray) -> np.ndarray:
-        """Multipliers of the inequality rows, positive at upper bounds, from those of the excesses."""
-        out, start = np.zeros(len(self.reduced.A) - self.reduced.equalities), 0
-        for sign, _, used in self._sides:
-            stop = start + np.count_nonzero(used)
-            out[used] += sign * multipliers[start:stop]
-            start = stop
+    @cached_property
+    def signs(self) -> np.ndarray:
+        """(rows, excesses): multipliers of the inequality rows, positive at upper bounds, by those of the excesses."""
+        used = [np.flatnonzero(rows) for _, _, rows in self._sides]
+        signs = [np.full(rows.size, sign) for (sign, _, _), rows in zip(self._sides, used, strict=True)]
+        rows = np.concatenate([np.zeros(0, np.intp), *used])
+        out = np.zeros((len(self.reduced.A) - self.reduced.equalities, rows.size))
+        out[rows, np.arange(rows.size)] = np.concatenate([np.zeros(0), *signs])
         return out
+
+    @cached_property
+    def pull(self) -> np.ndarray:
+        """(n, excesses) how multipliers of the excesses move the answer."""
+        return -self.lift[: self.size] @ self.lift[self.size :].T
 
     @cached_property
     def _tables(self) -> tuple[np.ndarray, np.ndarray, _Refinement | None]:

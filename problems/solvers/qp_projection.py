@@ -6,12 +6,30 @@ nothing but how far the rows are exceeded: no cost vector, no factors, and what 
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from problems.solvers.base import Options
 
 IMMOBILE = 1e-12  # share of the largest row below which a row does not move
 WRONG_SIGN = 1e-10  # a multiplier further below zero is no certificate
+
+
+class Projected(NamedTuple):
+    """Outputs at the optimum, and what was found of it.
+
+    Attributes:
+        multipliers: (rows,) >= 0, of the excesses.
+        violation: the largest excess.
+        gap: what multipliers and excesses differ from complementarity by.
+    """
+
+    outputs: np.ndarray
+    multipliers: np.ndarray
+    violation: float
+    gap: float
+    iterations: int
 
 
 class Projection:
@@ -32,13 +50,13 @@ class Projection:
         # a row that nothing moves has no place among those that are moved
         self._usable = bool((sizes > IMMOBILE * sizes.max(initial=0.0)).all())
         self._cold = np.zeros(len(sizes), dtype=np.intc)
-        self.restart()
+        self._model: Any = None
 
     def restart(self) -> None:
         """Forget the working set."""
         self._model = None
 
-    def _set_up(self) -> None:
+    def _set_up(self) -> Any:
         import daqp
 
         rows, size = self._half.shape
@@ -48,18 +66,16 @@ class Projection:
         model.settings = {"primal_tol": tolerance, **{k: v for k, v in limits.items() if v is not None}}
         free = np.full(rows, np.inf)
         model.setup(np.eye(size), np.zeros(size), self._half, free, -free, self._cold)
+        return model
 
-    def __call__(self, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, int] | None:
-        """The outputs moved, multipliers (rows,) >= 0 of the excesses, and daqp's iterations.
+    def __call__(self, outputs: np.ndarray) -> Projected | None:
+        """The outputs moved; None where daqp finds nothing, or nothing that stands the check.
 
-        None where daqp finds nothing, or nothing that stands the check: excesses, signs and complementarity; the
-        gradient is that of the multipliers by construction.
+        Excesses, signs and complementarity are checked; the gradient is that of the multipliers by construction.
         """
         if not self._usable:
             return None
-        if self._model is None:
-            self._set_up()
-        model = self._model
+        model = self._set_up() if self._model is None else self._model
         bound = np.negative(outputs[self._excess])
         if model.update(None, None, None, bound, None, None if self._warm else self._cold) >= 0:
             _, _, flag, info = model.solve()
@@ -67,11 +83,12 @@ class Projection:
                 multipliers = info["lam"]
                 moved = outputs - self._lift.dot(self._pull.dot(multipliers))
                 excess, tolerance = moved[self._excess], self._options.tolerance
+                violation, gap = excess.item(excess.argmax()), abs(float(multipliers.dot(excess)))
                 if (
-                    excess.item(excess.argmax()) <= tolerance
-                    and abs(multipliers.dot(excess)) <= tolerance
+                    violation <= tolerance
+                    and gap <= tolerance
                     and multipliers.item(multipliers.argmin()) >= -WRONG_SIGN
                 ):
-                    return moved, multipliers, info["iterations"]
+                    return Projected(moved, multipliers, violation, gap, info["iterations"])
         self._model = None  # after a refusal the library can go on claiming success
         return None

@@ -1,13 +1,14 @@
 """Solves one after the other, each of whose data are those of the one before, moved on, and a function of its answer.
 
-A moving horizon is one: a record of measurements comes in, the oldest goes, and the arrival cost follows from answer and
-data. While weights and pattern stay, what is reported, all excesses over bounds and the arrival cost of the next window
-are one product with the window's numbers. All unknowns, residuals and multipliers are worked out when they are read.
+A moving horizon is one: a record of measurements comes in, the oldest goes, and the arrival cost follows from answer
+and data. While weights and pattern stay, what is reported, all excesses over bounds and the arrival cost of the next
+window are one product with the window's numbers. All unknowns, residuals and multipliers are worked out when read.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +16,8 @@ import numpy as np
 from problems.lazy import lazy
 from problems.solvers.base import Status
 from problems.solvers.qp_maps import DenseMap
-from problems.solvers.qp_projection import Projection
-from problems.solvers.qp_solution import QPCheck
+from problems.solvers.qp_projection import Projected, Projection
+from problems.solvers.qp_solution import NEGLIGIBLE, QPCheck
 from problems.solvers.session import Solution
 
 if TYPE_CHECKING:
@@ -103,14 +104,14 @@ class Recursion:
         out = self._matrix.dot(data)
         rows = out[self._rows]
         violation = rows.item(rows.argmax())  # a third of the time of `max`
-        multipliers, iterations = None, 0
+        held = None
         if not violation <= self._tolerance:
-            found = None if violation != violation or self._projection is None else self._projection(out)
-            if found is None:
+            held = None if violation != violation or self._projection is None else self._projection(out)
+            if held is None:
                 return None
-            out, multipliers, iterations = found
+            out, violation = held.outputs, held.violation
         self.data, self._now = data, out[self._next]
-        return RecursionSolution(self, data, out[self._reported], violation, multipliers, iterations)
+        return RecursionSolution(self, data, out[self._reported], violation, held)
 
     @property
     def records(self) -> np.ndarray:
@@ -127,15 +128,6 @@ class Recursion:
         out = self._fixed.copy()
         out[self._columns] = data[:-1]
         return out
-
-    def point(self, numbers: np.ndarray, multipliers: np.ndarray | None) -> np.ndarray:
-        """All unknowns."""
-        z = self.map(numbers)[0]
-        if multipliers is None:
-            return z
-        assert isinstance(self.map, DenseMap)
-        lift, n = self.map.lift, self.map.size
-        return z - lift[:n] @ (lift[n:].T @ multipliers)
 
     @lazy
     def no_multipliers(self) -> dict[str, np.ndarray] | None:
@@ -155,15 +147,19 @@ class Recursion:
         return QPCheck(self.session.program, self.session.store, numbers, self.map, numbers, None).rows
 
     @lazy
-    def certificate(self) -> np.ndarray | None:
-        """Bounds (2, data) of dual and primal residuals of answers without active rows, see `StackedRows.certificate`;
-        None where there are none.
+    def certificate(self) -> tuple[float, float, float, float] | None:
+        """Bounds of the residuals of all answers: the dual one per length of a step's data and of its multipliers, the
+        primal one per length of the same. See `StackedRows.certificate`. None where there are none.
         """
         if not isinstance(self.map, DenseMap):
             return None
-        fixed = np.abs(self._fixed)
-        parts = self.stacked.certificate(self.map)
-        return np.array([np.append(by[self._columns], by @ fixed + constant) for by, constant in parts])
+        rows, fixed = self.stacked, np.abs(self._fixed)
+        by_data = [np.append(by[self._columns], by @ fixed + constant) for by, constant in rows.certificate(self.map)]
+        by_multiplier = rows.certificate_held(self.map)
+        dual, dual_held, primal, primal_held = (
+            float(np.linalg.norm(by)) for kind in zip(by_data, by_multiplier, strict=True) for by in kind
+        )
+        return dual, dual_held, primal, primal_held
 
 
 class RecursionSolution(Solution):
@@ -171,8 +167,10 @@ class RecursionSolution(Solution):
 
     Attributes:
         reported: (r,) unknowns that were asked for.
+        spent: seconds of the step, by who took it.
     """
 
+    spent = 0.0
     status, message = Status.SOLVED, ""
 
     def __init__(
@@ -181,12 +179,11 @@ class RecursionSolution(Solution):
         data: np.ndarray,
         reported: np.ndarray,
         violation: float,
-        multipliers: np.ndarray | None,
-        iterations: int,
+        held: Projected | None,
     ) -> None:
         # everything else of a solution is below, for whoever reads it
         self._recursion, self._data, self.reported = recursion, data, reported
-        self._violation, self._held, self.iterations = violation, multipliers, iterations
+        self._violation, self._held = violation, held
 
     @lazy
     def _layout(self) -> Layout:
@@ -197,8 +194,12 @@ class RecursionSolution(Solution):
         return "linear" if self._held is None else self._recursion.session.solver
 
     @lazy
-    def seconds(self) -> dict[str, float]:
-        return {"update": 0.0}
+    def iterations(self) -> int:
+        return 0 if self._held is None else self._held.iterations
+
+    @lazy
+    def seconds(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return {"update": 0.0, "solve": self.spent}
 
     @lazy
     def _numbers(self) -> np.ndarray:
@@ -206,27 +207,49 @@ class RecursionSolution(Solution):
 
     @lazy
     def point(self) -> np.ndarray:
-        return self._recursion.point(self._numbers, self._held)
+        map_ = self._recursion.map
+        z = map_(self._numbers)[0]
+        if self._held is not None:
+            assert isinstance(map_, DenseMap)
+            z = z + map_.pull.dot(self._held.multipliers)
+        return z
+
+    @lazy
+    def _by_row(self) -> np.ndarray | None:
+        """Multipliers of the inequality rows."""
+        if self._held is None:
+            return None
+        assert isinstance(self._recursion.map, DenseMap)
+        return self._recursion.map.signs.dot(self._held.multipliers)
 
     @lazy
     def _check(self) -> QPCheck:
-        recursion, mu = self._recursion, None
-        if self._held is not None:
-            assert isinstance(recursion.map, DenseMap)
-            mu = recursion.map.by_row(self._held)
-        session = recursion.session
-        return QPCheck(session.program, session.store, self._numbers, recursion.map, self.point, mu)
+        recursion, session = self._recursion, self._recursion.session
+        return QPCheck(session.program, session.store, self._numbers, recursion.map, self.point, self._by_row)
 
-    @lazy
+    @property
     def residuals(self) -> dict[str, float]:
-        """As those of every solution; without active rows by a bound that holds for all data (`certificate`)."""
+        """As those of every solution, but by bounds that hold whatever the data are (`Recursion.certificate`)."""
         certificate = self._recursion.certificate
-        if self._held is not None or certificate is None:
+        if certificate is None:
             return self._check.residuals()
-        dual, primal = certificate.dot(np.abs(self._data)).tolist()
-        return {"primal": max(primal, self._violation, 0.0), "dual": dual, "gap": 0.0}
+        dual, dual_held, primal, primal_held = certificate
+        data, held = self._data, self._held
+        size = sqrt(data.dot(data))
+        if held is None:
+            return {"primal": max(primal * size, self._violation, 0.0), "dual": dual * size, "gap": 0.0}
+        pull = sqrt(held.multipliers.dot(held.multipliers))
+        gap = held.gap if held.gap <= NEGLIGIBLE else held.gap / max(1.0, abs(self.objective))
+        primal = max(primal * size + primal_held * pull, self._violation, 0.0)
+        return {"primal": primal, "dual": dual * size + dual_held * pull, "gap": gap}
 
-    @lazy
+    @property
     def multipliers(self) -> dict[str, np.ndarray]:
-        none = self._recursion.no_multipliers if self._held is None else None
-        return self._check.multipliers() if none is None else none.copy()
+        none = self._recursion.no_multipliers
+        if none is None:
+            return self._check.multipliers()
+        if self._held is None:
+            return none.copy()
+        mu = self._by_row
+        assert mu is not None
+        return {name: mu[part].reshape(shape) for name, part, shape in self._recursion.stacked.inequalities}

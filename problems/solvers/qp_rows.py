@@ -145,13 +145,27 @@ class StackedRows:
         rows = self._rows[: self._missed.stop]
         M, given = rows[:, :n], rows[:, n + self._free.size :]
         values, sizes = M @ V + given, np.abs(M) @ np.abs(V) + np.abs(given)
+        largest = self._bounds(values, sizes, V.shape[1])
+        first, second = ((np.ascontiguousarray(part[:-1]), float(part[-1])) for part in largest)
+        return first, second
+
+    def certificate_held(self, map_: DenseMap) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (excesses,) of the sizes of their multipliers that bound what these add to dual and primal residual
+        of an answer of the map that they move by ``map_.pull``.
+        """
+        n, V, S = map_.size, map_.pull, map_.signs
+        rows = self._rows[: self._missed.stop]
+        M, held = rows[:, :n], rows[:, n : n + self._free.size]
+        return self._bounds(M @ V + held @ S, np.abs(M) @ np.abs(V) + np.abs(held) @ np.abs(S), sum(map_.lift.shape))
+
+    def _bounds(self, values: np.ndarray, sizes: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+        """Largest entry of every column of gradient and equalities, rounding of sums of `length` included."""
         dual = values[self._gradient]
         if self.equalities:
             dual = dual - self._equal.T @ (self._inverse @ dual)
-        rounding = 2 * V.shape[1] * np.finfo(float).eps
+        rounding = 2 * length * np.finfo(float).eps
         parts = ((dual, sizes[self._gradient]), (values[self._missed], sizes[self._missed]))
-        largest = [(np.abs(exact) + rounding * size).max(axis=0, initial=0.0) for exact, size in parts]
-        first, second = ((np.ascontiguousarray(part[:-1]), float(part[-1])) for part in largest)
+        first, second = ((np.abs(exact) + rounding * size).max(axis=0, initial=0.0) for exact, size in parts)
         return first, second
 
     def active(self, z: np.ndarray, d: np.ndarray, mu: np.ndarray | None) -> np.ndarray:

@@ -200,10 +200,9 @@ class QPSession(Session):
         found = self._projection[1](np.concatenate((z, excess)))
         if found is None:
             return None
-        outputs, multipliers, iterations = found
-        z = outputs[: map_.size]
-        check = _check(self, numbers, map_, z, map_.by_row(multipliers))
-        return Solution(self.layout, z, Status.SOLVED, self.solver, check, iterations)
+        z = found.outputs[: map_.size]
+        check = _check(self, numbers, map_, z, map_.signs.dot(found.multipliers))
+        return Solution(self.layout, z, Status.SOLVED, self.solver, check, found.iterations)
 
     def projection(self, lift: np.ndarray, excess: slice) -> Projection:
         """A `Projection` by the options of this session."""
