@@ -259,6 +259,8 @@ class HPIPM(_Conic):
             # the rounding of what stands for an infinite bound is what the residual of bounds cannot get below
             res_d_max=max(tolerance, 4.0 * np.finfo(float).eps * self._infinity),
             res_m_max=tolerance,
+            # with its own, large one it ends at the first step where the minimiser of the costs violates bounds
+            mu0=None if self._scaling is None else 1.0,
             lam_min=1e-25,
             iter_max=common.iteration_limit,
         )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from problems.solvers.base import QPResult, Status
+from problems.solvers.qp_scaling import hidden_error
 
 _CHEAP = 200_000  # numbers in the linear program of a certificate
 _EXACT = 1e-7  # what the linear program itself is good for
@@ -76,10 +77,11 @@ def judge(
 ) -> tuple[Status, QPResult]:
     """What `result` is worth, by our residuals.
 
-    A point within `tolerance` is solved, whatever the backend says of it. A point beyond it that was claimed to be a
-    solution is inaccurate. Bounds that cross are infeasible at once. Claims of infeasibility and unboundedness are
-    believed unless a linear program finds the contrary; and where a backend failed or gave up far from a solution, a
-    linear program says whether the problem is to blame.
+    A point within `tolerance` is solved, whatever the backend says of it, unless weights differ so much that relative
+    residuals hide a larger share of the cost (`hidden_error`). A point beyond it that was claimed to be a solution is
+    inaccurate. Bounds that cross are infeasible at once. Claims of infeasibility and unboundedness are believed unless
+    a linear program finds the contrary; and where a backend failed or gave up far from a solution, a linear program
+    says whether the problem is to blame.
 
     Args:
         result: what the backend returned.
@@ -105,8 +107,11 @@ def judge(
         return _without_point(result, Status.FAILED, "the point is not finite")
     claimed = claim in (Status.SOLVED, Status.INACCURATE)
     found = residuals(P, q, A, l, u, x, np.zeros(l.size) if y is None else y)
+    hidden = 0.0
     if y is not None and found.within(tolerance):
-        return Status.SOLVED, replace(result, status=Status.SOLVED)
+        hidden = hidden_error(P, q, A, l, u, x, y, tolerance)
+        if hidden <= tolerance:
+            return Status.SOLVED, replace(result, status=Status.SOLVED)
     if not np.isfinite(found.worst):
         return _without_point(result, Status.FAILED, "the residuals are not finite")
     if found.primal > max(tolerance, 1e-6) * found.primal_size and is_infeasible(A, l, u):
@@ -117,6 +122,8 @@ def judge(
         return claim, result
     if y is None:
         message = _joined("no multipliers to judge the point by", message)
+    elif hidden:
+        message = _joined(f"weights differ much; the cost may be {hidden:.1e} too high", message)
     else:
         message = _joined(f"largest relative residual {found.worst:.1e}, asked for {tolerance:.1e}", message)
     return Status.INACCURATE, replace(result, status=Status.INACCURATE, message=message)

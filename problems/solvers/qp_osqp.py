@@ -97,6 +97,7 @@ class OSQP(Backend):
             time_limit=common.time_limit,
             max_iter=common.iteration_limit,
             verbose=False,
+            **self._unscaled(),
         )
         for name, value in values.items():
             setattr(settings, name, value)
@@ -106,6 +107,17 @@ class OSQP(Backend):
         self._origin = np.zeros(n), np.zeros(m)
         l, u = self._clipped(l, u)
         self._solver = lib.OSQPSolver(lib.CSC(self._upper.matrix), q, lib.CSC(self._A), l, u, m, n, settings)
+
+    def _unscaled(self) -> dict[str, float]:
+        """The library's own scaling off where it does harm.
+
+        It scales the cost by q, which at a point far from the origin is large: P becomes small beside the
+        regularization sigma. Without rows, thousands of steps of a millionth of the way follow. With rows they restrain
+        it, unless weights differ much; and then ours has been there already.
+        """
+        if not self._m:
+            return {"scaling": 0, "alpha": 1.0}
+        return {"scaling": 0} if self._scaling is not None else {}
 
     def _run(self, q: np.ndarray, l: np.ndarray, u: np.ndarray, warm: Warm | None) -> QPResult:
         solver = self._solver

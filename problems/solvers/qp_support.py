@@ -20,9 +20,9 @@ import numpy as np
 
 from problems.errors import BackendError, DataError, HorizonetError, MissingExtraError, SettingError
 from problems.solvers.base import Options, QPResult, Status
+from problems.solvers.qp_scaling import EVEN, MISLEADING, Scaling, Warm, uneven
 from problems.solvers.settings import read_settings
 
-Warm = tuple[np.ndarray, np.ndarray]
 S = TypeVar("S")
 
 
@@ -278,13 +278,15 @@ class Backend(ABC):
             self._library: Any = importlib.import_module(self.module)
         except ImportError as error:
             raise MissingExtraError(f"solver {self.name}", self.package, self.extra) from error
-        self._P, self._A = self._taken("P", P), self._taken("A", A)
+        self._take(P, A, l == u)
         self._n, self._m = P.shape[0], A.shape[0]
         self._last_y: np.ndarray | None = None
         # Vectors that cannot be solved yet leave the building to the first solve.
         self._stale = not (np.isfinite(q).all() and (l <= u).all())
         if not self._stale:
             try:
+                if self._scaling is not None:
+                    q, l, u, _ = self._scaling.given(q, l, u, None)
                 self._build(q, l, u)
             except HorizonetError:
                 raise
@@ -300,7 +302,10 @@ class Backend(ABC):
             if isinstance(ordered, QPResult):
                 return ordered
             l, u = ordered
+        scaling = self._scaling
         try:
+            if scaling is not None:
+                q, l, u, warm = scaling.given(q, l, u, warm)
             if self._stale:
                 self._last_y = None
                 self._build(q, l, u)
@@ -310,7 +315,7 @@ class Backend(ABC):
                 self._stale = True
                 return QPResult(None, None, Status.FAILED, result.iterations, "the library returned NaN")
             self._last_y = result.y
-            return result
+            return result if scaling is None else scaling.taken(result)
         except (KeyboardInterrupt, SystemExit):
             raise
         # Panics of Rust libraries derive from BaseException.
@@ -324,9 +329,11 @@ class Backend(ABC):
         Raises:
             DataError: P or A is not finite.
         """
-        P, A = self._taken("P", P), self._taken("A", A)
-        same = _same_pattern(P, self._P) and _same_pattern(A, self._A)
-        self._P, self._A = P, A
+        before = self._P, self._A
+        scaled = self._scaling is not None
+        self._take(P, A, self._equal_rows)
+        same = _same_pattern(self._P, before[0]) and _same_pattern(self._A, before[1])
+        same = same and scaled == (self._scaling is not None)
         self._last_y = None
         if not same:
             self._stale = True
@@ -363,6 +370,18 @@ class Backend(ABC):
     def _renew(self) -> None:
         """Bring the library's object to the present matrices; by default it is built again at the next solve."""
         self._stale = True
+
+    def _take(self, P: Any, A: Any, equal: np.ndarray) -> None:
+        """The matrices as the library is given them, scaled where weights differ much."""
+        self._equal_rows = equal
+        self._P, self._A = self._taken("P", P), self._taken("A", A)
+        # a dense P tells more of its weights
+        seen = P if isinstance(P, np.ndarray) else self._P
+        if not uneven(seen, MISLEADING if self.dense else EVEN, by_diagonal=self.dense):
+            self._scaling = None
+            return
+        self._scaling = scaling = Scaling(seen, A if isinstance(A, np.ndarray) else self._A, equal)
+        self._P, self._A = self._taken("P", scaling.P), self._taken("A", scaling.A)
 
     def _taken(self, name: str, matrix: Any) -> Any:
         """`matrix` as this backend stores it; whether it comes dense or sparse, no number may be NaN or infinite."""
