@@ -13,11 +13,14 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.linalg.lapack import dtbtrs  # type: ignore[attr-defined]
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from problems.errors import EmptyConstraintError, FormError
 
 Matrix = Any
+SOLVED = 2.0  # numbers of a map per number in its equalities, beyond which they are solved at each point
+NARROW = 4  # numbers within a band per entry, up to which it is solved as a whole
 SINGULAR = 1e12  # condition number from which equalities do not determine unknowns
 
 
@@ -35,9 +38,58 @@ class AffineMap:
             return cls(np.eye(size), np.zeros((size, data)), np.zeros(size))
         return cls(sp.eye_array(size, format="csr"), sp.csr_array((size, data)), np.zeros(size))
 
+    def at(self, v: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """z (n,)."""
+        return self.Z @ v + self.Y @ d + self.z0
+
     def then(self, inner: AffineMap) -> AffineMap:
         """This map with its v given by `inner`."""
         return AffineMap(self.Z @ inner.Z, self.Y + self.Z @ inner.Y, self.z0 + self.Z @ inner.z0)
+
+
+@dataclass(eq=False)
+class SolvedMap(AffineMap):
+    """The same through the equalities, where a solve multiplies fewer numbers than Z and Y hold (long windows).
+
+    Attributes:
+        places: in z, of v and of the unknowns that `block` solves from ``right (v, d) + c``.
+    """
+
+    places: tuple[Any, Any]
+    block: Any
+    right: Matrix
+    c: np.ndarray
+
+    def at(self, v: np.ndarray, d: np.ndarray) -> np.ndarray:
+        z = np.empty(self.z0.size)
+        z[self.places[0]] = v
+        b = self.right @ np.concatenate((v, d))
+        b += self.c
+        z[self.places[1]] = self.block.solve(b)
+        return z
+
+
+class BandedTriangle:
+    """Solver of a lower triangular matrix whose entries are near the diagonal, as of states that follow each other."""
+
+    def __init__(self, band: np.ndarray) -> None:
+        self._band = band
+
+    @classmethod
+    def of(cls, block: sp.csr_array) -> BandedTriangle | None:
+        """None for another matrix."""
+        entries, size = block.tocoo(), len(block.indptr) - 1
+        below = entries.row - entries.col
+        width = int(below.max())
+        if below.min() < 0 or width * size > NARROW * entries.nnz:
+            return None
+        band = np.zeros((width + 1, size), order="F")
+        band[below, entries.col] = entries.data
+        return cls(band)
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        solution: Any = dtbtrs(self._band, right, uplo="L")
+        return solution[0]
 
 
 def defining_rows(R: Matrix, columns: np.ndarray) -> np.ndarray:
@@ -93,11 +145,20 @@ def eliminate(R: Matrix, E: Matrix, c: np.ndarray, columns: np.ndarray, names: s
             (np.ones(columns.size), (columns, np.arange(columns.size))), shape=(size, columns.size)
         )
         stay: Any = sp.csr_array((np.ones(kept.size), (kept, np.arange(kept.size))), shape=(size, kept.size))
-        Z = (stay + place @ sp.csr_array(solved[0])).tocsr()
-        Y = (place @ sp.csr_array(solved[1])).tocsr()
+        Z: Any = (stay + place @ sp.csr_array(solved[0])).tocsr()
+        Y: Any = (place @ sp.csr_array(solved[1])).tocsr()
     z0 = np.zeros(size)
     z0[columns] = np.asarray(solved[2]).ravel()
+    if not dense and Z.nnz + Y.nnz > SOLVED * (block.nnz + right[0].nnz + right[1].nnz):
+        solver, numbers = BandedTriangle.of(block) or factor, sp.hstack(right[:2], format="csr")
+        return SolvedMap(Z, Y, z0, (_places(kept), _places(columns)), solver, -numbers, -c[used]), used
     return AffineMap(Z, Y, z0), used
+
+
+def _places(index: np.ndarray) -> Any:
+    """A slice where the places follow each other, which is read and written faster."""
+    start = int(index[0]) if index.size else 0
+    return slice(start, start + index.size) if (np.diff(index) == 1).all() else index
 
 
 def _condition(block: np.ndarray) -> float:

@@ -27,9 +27,10 @@ from problems.forms.affine import (
 )
 from problems.forms.condensing import AffineMap, eliminate, null_space
 from problems.forms.layout import INFINITE, Activity, DataStore, Layout, constant_rows
+from problems.forms.template import template_of
 from problems.problem import DataSlot, Problem, Slot, Variable
 
-DENSE_LIMIT = 500  # unknowns plus data; beyond, matrices are sparse
+DENSE_LIMIT = 150_000  # numbers in the largest matrices of the dense form; beyond, matrices are sparse
 PATTERNS = 64  # patterns of missing data whose matrices are kept
 MATRICES = 16  # sets of matrix data whose condensed programs are kept
 
@@ -95,6 +96,11 @@ class Reduced:
     @property
     def dense(self) -> bool:
         return isinstance(self.map.Z, np.ndarray)
+
+    @property
+    def bounds_vary(self) -> bool:
+        """Whether data are bounds."""
+        return bool((self.lower.index >= 0).any() or (self.upper.index >= 0).any())
 
     @cached_property
     def inner(self) -> AffineMap | None:
@@ -170,6 +176,12 @@ class Reduced:
     def bounds(self, numbers: np.ndarray, flags: dict[str, np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the rows ``A v`` for given data."""
         shift = self.E @ numbers + self.c
+        lower, upper = self.limits(numbers, flags)
+        zero = np.zeros(self.equalities)
+        return np.concatenate([zero, lower]) - shift, np.concatenate([zero, upper]) - shift
+
+    def limits(self, numbers: np.ndarray, flags: dict[str, np.ndarray | None]) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of the inequalities themselves, infinite where there is none or an instance is off."""
         lower, upper = self.lower(numbers), self.upper(numbers)
         if self.bounded:
             off = self.off_rows(flags)
@@ -177,8 +189,7 @@ class Reduced:
                 lower, upper = np.where(off, -np.inf, lower), np.where(off, np.inf, upper)
         lower = np.where(lower <= -INFINITE, -np.inf, lower)
         upper = np.where(upper >= INFINITE, np.inf, upper)
-        zero = np.zeros(self.equalities)
-        return np.concatenate([zero, lower]) - shift, np.concatenate([zero, upper]) - shift
+        return lower, upper
 
     def off_rows(self, flags: dict[str, np.ndarray | None]) -> np.ndarray | None:
         """Inequality rows of instances that are switched off, or None."""
@@ -201,7 +212,7 @@ class Given:
         self.D: np.ndarray = np.ascontiguousarray(_stack([reduced.E, reduced.map.Y]))
         self.d = np.concatenate([reduced.c, reduced.map.z0])
         self._fixed = None
-        if not ((reduced.lower.index >= 0).any() or (reduced.upper.index >= 0).any()):
+        if not reduced.bounds_vary:
             l, u = reduced.bounds(np.zeros(reduced.E.shape[1]), flags)
             self._fixed = l + reduced.c, u + reduced.c
 
@@ -286,16 +297,31 @@ class QuadraticProgram:
         require_affine(problem)
         self.problem, self.layout = problem, Layout(problem)
         self.speeds = data_speeds(problem)
-        self.dense = self.layout.size + self.layout.data_size <= DENSE_LIMIT if dense is None else dense
+        self.eliminated = [_slot(entry, problem) for entry in eliminate]
+        places = [self.layout.columns(slot).ravel() for slot in self.eliminated]
+        self._columns = np.unique(np.concatenate([np.zeros(0, np.intp), *places]))
+        self.dense = self._dense_numbers() <= DENSE_LIMIT if dense is None else dense
         self.activity = Activity(self.layout)
         self.rows = AffineRows(self.layout, self.speeds, self.dense)
-        self.eliminated = [_slot(entry, problem) for entry in eliminate]
         self._names = [entry.term.name for entry in self.layout.terms]
         self._reduced: dict[bytes, Reduced] = {}
         starts, inputs = self.layout.data_start, problem.inputs
         matrix = [n for n, speed in self.speeds.items() if speed == "matrix"]
         at = [np.arange(starts[n], starts[n] + inputs[n].rows * inputs[n].size) for n in matrix]
         self._matrix = np.concatenate([np.zeros(0, np.intp), *at])
+
+    def _dense_numbers(self) -> int:
+        """Numbers in the largest matrices that the dense form holds.
+
+        Every solve multiplies the map from the data to unknowns and bounded rows. Set-up factorizes the Hessian of the
+        unknowns that elimination leaves and the block of those it solves, or a basis of all where equalities remain.
+        """
+        rows = {"cost": 0, "equality": 0, "inequality": 0}
+        for term in self.problem.terms.values():
+            rows[term.kind] += term.count * template_of(term).dim
+        size, solved = self.layout.size, self._columns.size
+        square = size**2 if rows["equality"] > solved else solved**2 + (size - solved) ** 2
+        return (size + rows["inequality"]) * self.layout.data_size + square
 
     def condense(self, eliminate: Sequence[Any]) -> QuadraticProgram:
         """The same program with further unknowns condensed away. Raises FormError."""
@@ -355,9 +381,8 @@ class QuadraticProgram:
         else:
             R, E, c = map_.Z[:0], map_.Y[:0], np.zeros(0)
         if self.eliminated:
-            columns = np.unique(np.concatenate([self.layout.columns(s).ravel() for s in self.eliminated]))
             names = ", ".join(s.source.name for s in self.eliminated)
-            map_, used = eliminate(R, E, c, columns, names)
+            map_, used = eliminate(R, E, c, self._columns, names)
             rest = np.setdiff1d(np.arange(R.shape[0]), used)
             R, E, c = R[rest], E[rest], c[rest]
         return Reduced(rows, lower, upper, map_, (R, E, c))

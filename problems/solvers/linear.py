@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.linalg.lapack import dpbtrf, dpbtrs  # type: ignore[attr-defined]
 
 from problems.errors import UnobservableError
 from problems.forms.layout import Layout
 
 FREE = 1e-12  # eigenvalue of a Hessian scaled to unit diagonal, below which a direction is free
+NARROW = 2  # numbers within the band per entry, up to which the band is factorized as a whole
 SHIFT = 1e-10  # added to a scaled singular system to find its free direction
 
 
@@ -48,9 +50,36 @@ def factorized_kkt(P: Any, A: Any) -> tuple[Callable[[np.ndarray], np.ndarray] |
     return lambda right: (scale * factor.solve((scale * right.T).T).T).T, None, float(1 / max(growth, 1e-300))
 
 
+class _Band:
+    """Cholesky factor of a positive definite matrix with entries near the diagonal, as of states in a chain."""
+
+    def __init__(self, factor: np.ndarray) -> None:
+        self._factor = factor
+
+    @classmethod
+    def of(cls, system: Any) -> _Band | None:
+        """None for another matrix."""
+        entries = system.tocoo()
+        below, size = entries.row - entries.col, system.shape[0]
+        width = int(below.max(initial=0))
+        if width * size > NARROW * entries.nnz:
+            return None
+        lower = below >= 0
+        band = np.zeros((width + 1, size), order="F")
+        band[below[lower], entries.col[lower]] = entries.data[lower]
+        factor, info = dpbtrf(band, lower=1)
+        return cls(factor) if info == 0 else None
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        return dpbtrs(self._factor, right, lower=1)[0]
+
+
 def _symmetric_lu(system: Any, indefinite: bool) -> Any:
     if indefinite:
         return spla.splu(sp.csc_matrix(system), permc_spec="COLAMD")
+    band = _Band.of(system)
+    if band is not None:
+        return band
     options = {"SymmetricMode": True}
     return spla.splu(sp.csc_matrix(system), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs  # type: ignore[attr-defined]
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 WEAK = 1e-6  # the same share, or an eigenvalue of the scaled Hessian, below which answers are refined
 REFINEMENTS = 2
+FEW = 20_000  # numbers of a table that are multiplied within a few microseconds
 INDEPENDENT = 1e-13  # share of a Hessian diagonal left after elimination, below which a direction may be free
 
 Vectors = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -270,6 +272,10 @@ class SparseMap:
         self.reduced, self.flags = reduced, flags
         self.rows: StackedRows | None = None
         self.P, self.Q, self.q0 = reduced.weighted(store, flags, pattern)
+        self._lifts = bool(program.eliminated)
+        m = reduced.equalities
+        self._right = sp.vstack([self.Q, reduced.E[:m]], format="csr"), np.concatenate([self.q0, reduced.c[:m]])
+        self._limits = None if reduced.bounds_vary else reduced.limits(np.zeros(program.layout.data_size), flags)
         solver, flat, smallest = factorized_kkt(self.P, reduced.A[: reduced.equalities])
         self.free, self.definite = None, flat is None
         self._solve: Any = solver
@@ -282,20 +288,52 @@ class SparseMap:
 
     def __call__(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reduced = self.reduced
-        m = reduced.equalities
-        q = self.Q @ numbers + self.q0
-        shift = reduced.E @ numbers + reduced.c
-        found = self._solve(np.concatenate([-q, -shift[:m]]))
+        v = self._unbounded(numbers)
+        z = reduced.map.at(v, numbers) if self._lifts else v
+        if not reduced.bounded:
+            return z, v[:0]
+        l, u = reduced.limits(numbers, self.flags) if self._limits is None else self._limits
+        R, E, c = self._bounded
+        rows = R @ z
+        rows += c
+        if E.nnz:
+            rows += E @ numbers
+        return z, np.concatenate([rows - u, l - rows])
+
+    @cached_property
+    def _bounded(self) -> tuple[Any, Any, np.ndarray]:
+        """The inequality rows in all unknowns, few numbers each however much was eliminated."""
+        rows = self.reduced.bounded
+        R, E = (sp.vstack([getattr(r, part) for r in rows], format="csr") for part in ("R", "E"))
+        return R, E, np.concatenate([r.c for r in rows])
+
+    def _unbounded(self, numbers: np.ndarray) -> np.ndarray:
+        """The coordinates v of the answer."""
+        reduced, (D, d) = self.reduced, self._right
+        table = self._table
+        if table is not None:
+            return table[0].dot(numbers) + table[1]
+        size = reduced.size
+        right = D @ numbers
+        right += d
+        found = self._solve(-right)
         if self._gradient is not None:
-            E = reduced.A[:m]
+            E = reduced.A[: reduced.equalities]
             for _ in range(REFINEMENTS):
-                v, y = found[: reduced.size], found[reduced.size :]
-                found = found - self._solve(np.concatenate([self._gradient(v, numbers) + E.T @ y, E @ v + shift[:m]]))
-        v = found[: reduced.size]
-        z = reduced.map.Z @ v + reduced.map.Y @ numbers + reduced.map.z0
-        l, u = reduced.bounds(numbers, self.flags)
-        rows = reduced.A[m:] @ v
-        return z, np.concatenate([rows - u[m:], l[m:] - rows])
+                v, y = found[:size], found[size:]
+                missed = E @ v + right[size:]
+                found = found - self._solve(np.concatenate([self._gradient(v, numbers) + E.T @ y, missed]))
+        return found[:size]
+
+    @cached_property
+    def _table(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """``v = V d + v0`` where few unknowns are left, so that V multiplies less than a solve."""
+        D, d = self._right
+        size = self.reduced.size
+        if self._gradient is not None or size * self.Q.shape[1] > FEW:
+            return None
+        found = self._solve(-np.column_stack([D.toarray(), d]))[:size]
+        return np.ascontiguousarray(found[:, :-1]), found[:, -1]
 
     once = __call__
 

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 import problems.forms.quadratic as quadratic
 from problems import Gaussian, Problem, Vector
 from problems.errors import EmptyConstraintError, FormError
-from problems.forms.condensing import AffineMap, eliminate, null_space
+from problems.forms.condensing import AffineMap, BandedTriangle, SolvedMap, eliminate, null_space
 from problems.forms.quadratic import QuadraticProgram
 
 A = np.array([[0.9, 0.2, 0.0], [-0.1, 0.8, 0.3], [0.0, 0.1, 0.7]])
@@ -116,6 +116,29 @@ def test_of_too_many_rows_a_determining_set_is_used(as_sparse: bool) -> None:
     R[:, :2] = [[1.0, 2.0], [2.0, 4.0], [0.0, 0.0], [-3.0, -6.0]]
     with pytest.raises(FormError, match=r"cannot eliminate x: .*\(singular\)"):
         eliminate(make(R), make(E), c, np.array([0, 1]), "x")
+
+
+@pytest.mark.parametrize("order", ["chain", "backwards", "shuffled"])
+def test_long_chains_are_solved_instead_of_multiplied(order: str) -> None:
+    steps, n = 30, 3
+    R, E = np.zeros((steps * n, (steps + 1) * n)), np.zeros((steps * n, 2 * steps))
+    for k in range(steps):
+        place = slice(n * k, n * k + n)
+        R[place, place], R[place, n * k + n : n * k + 2 * n] = -A, 2.0 * np.eye(n)
+        E[place, 2 * k : 2 * k + 2] = GAIN
+    c = np.random.default_rng(9).normal(size=steps * n)
+    columns = np.arange(n, n * (steps + 1))
+    if order == "backwards":
+        R, columns = R[:, ::-1], columns - n
+    if order == "shuffled":
+        R = R[np.random.default_rng(1).permutation(len(R))]
+    map_, _ = eliminate(sp.csr_array(R), sp.csr_array(E), c, columns, "x")
+    assert isinstance(map_, SolvedMap) and isinstance(map_.block, BandedTriangle) == (order == "chain")
+    check_map(map_, R, E, c)
+    v, d = np.array([1.0, -2.0, 3.0]), np.random.default_rng(2).normal(size=2 * steps)
+    np.testing.assert_allclose(map_.at(v, d), map_.Z @ v + map_.Y @ d + map_.z0, atol=1e-12)
+    alone, _ = eliminate(sp.csr_array(R), sp.csr_array(0 * E), c, columns, "x")
+    np.testing.assert_allclose(R @ alone.at(v, d) + c, 0.0, atol=1e-12)
 
 
 def test_maps_compose() -> None:

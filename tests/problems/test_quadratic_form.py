@@ -226,10 +226,24 @@ def test_what_does_not_change_is_computed_once() -> None:
 
 def test_large_problems_are_sparse() -> None:
     p = Problem()
-    x = p.variables("x", Vector(2), DENSE_LIMIT)
+    count = int(DENSE_LIMIT**0.5)
+    x = p.variables("x", Vector(2), count)
     p.cost("c", same, on=x)
     got = QuadraticProgram(p).matrices().P
-    assert not isinstance(got, np.ndarray) and got.nnz == 2 * DENSE_LIMIT
+    assert not isinstance(got, np.ndarray) and got.nnz == 2 * count
+
+
+def test_what_elimination_leaves_decides_whether_matrices_are_dense() -> None:
+    p, count = Problem(), int(0.7 * DENSE_LIMIT**0.5)
+    x, w, z = p.variables("x", Vector(1), count), p.variables("w", Vector(1), count), p.data("z", 1)
+    p.cost("c", same, on=w)
+    p.equality("e", lambda x, w, z: x - w - z, on=(x, w), data=z)
+    assert not QuadraticProgram(p).dense
+    assert QuadraticProgram(p, [x]).dense
+    assert not QuadraticProgram(p, [x], dense=False).dense
+    bounds = p.data("bounds", 1, count)
+    p.inequality("b", same, on=x, upper=bounds)
+    assert not QuadraticProgram(p, [x]).dense
 
 
 def test_repr_says_how_large_it_is() -> None:
