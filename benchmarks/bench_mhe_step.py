@@ -282,9 +282,9 @@ def test_step_beside_do_mpc_cvxpy_and_daqp(capsys: pytest.CaptureFixture[str]) -
     high = [summary(times[name])[1] / 1e6 for name in ("ours", "daqp.solve")]
     record(Row("the same, 95 % quantile", "daqp.solve", high[0], high[1], wanted=1 / 3))
     if "do-mpc" in sides:
-        assert summary(times["do-mpc"])[0] >= 70 * median
+        assert summary(times["do-mpc"])[0] >= 200 * median
     if best is not None:
-        assert summary(times[best])[0] >= 30 * median
+        assert summary(times[best])[0] >= 70 * median
 
 
 def warm(values: Any) -> np.ndarray:
