@@ -130,7 +130,7 @@ class CostCode:
         self._entered: Bound | None = None
 
     def bind(self, store: DataStore, numbers: np.ndarray, flags: Flags) -> Bound:
-        """The costs for the data `numbers` (missing ones read as zero), which are kept, and weights in `store`."""
+        """The costs for the data `numbers` (missing ones read as zero) and the weights in `store`."""
         parameters = np.empty(self.free)
         parameters[: numbers.size] = numbers
         at = numbers.size
@@ -139,7 +139,7 @@ class CostCode:
             size = white.shape[0] * cost.count
             parameters[at : at + size].reshape(cost.count, white.shape[0])[:] = white.T
             at += size
-        return Bound(self, numbers, flags, parameters)
+        return Bound(self, parameters[: numbers.size], flags, parameters)
 
     def enter(self, bound: Bound) -> None:
         """Let programs read what is bound."""

@@ -32,7 +32,7 @@ class LeastSquares:
         """Costs as functions of the point alone, for the data in `store`."""
         numbers = store.numbers
         # one product tells that all are finite, unless they are huge
-        finite = bool(np.isfinite(numbers.dot(numbers)))
+        finite = bool(numbers.dot(numbers) < np.inf)
         key = self.activity.key(numbers, finite)
         flags = self._flags.get(key)
         if flags is None:
@@ -43,7 +43,7 @@ class LeastSquares:
             self._flags[key] = flags
         if not finite:
             store.require_finite()
-        return self.code.bind(store, numbers.copy() if finite else np.where(np.isnan(numbers), 0.0, numbers), flags)
+        return self.code.bind(store, numbers if finite else np.where(np.isnan(numbers), 0.0, numbers), flags)
 
 
 class Constraints:

@@ -95,15 +95,20 @@ def evaluate(function: Any, symbols: tuple[Any, Any, Any], size: int | None, wha
 
 
 class ArrayFunction:
-    """A CasADi Function of vectors called with arrays, through buffers allocated once; not for several threads."""
+    """The last output of a CasADi Function of vectors, called with arrays; not for several threads.
+
+    A column becomes an array (rows,), anything else (rows, columns).
+    """
 
     def __init__(self, function: ca.Function) -> None:
         self._sizes = [function.size1_in(k) for k in range(function.n_in())]
         self._arguments = [np.zeros(size) for size in self._sizes]
         shapes = [function.size_out(k) for k in range(function.n_out())]
         flat = [np.zeros(rows * columns) for rows, columns in shapes]
-        # CasADi writes column by column
-        self._results = [a.reshape(columns, rows).T for a, (rows, columns) in zip(flat, shapes, strict=True)]
+        rows, columns = shapes[-1]
+        self._result = (
+            flat[-1] if function.n_out() == 1 else flat[-1].reshape(columns, rows).T
+        )  # CasADi writes column by column
         buffer: Any
         buffer, self._run = function.buffer()
         self._buffer = buffer  # `_run` does not keep it alive
@@ -112,10 +117,8 @@ class ArrayFunction:
         for k, array in enumerate(flat):
             buffer.set_res(k, array.data)
 
-    def __call__(self, which: int, *values: Any) -> np.ndarray:
-        """Output `which`, as a new array: (rows,) for a column, else (rows, columns)."""
+    def __call__(self, *values: Any) -> np.ndarray:
         for target, value in zip(self._arguments, values, strict=True):
             target[:] = value
         self._run()
-        result = self._results[which]
-        return result[:, 0].copy() if which == 0 else result.copy()
+        return self._result.copy()

@@ -148,10 +148,18 @@ class Model(ABC):
 
     @cached_property
     def _transition(self) -> ArrayFunction:
-        return ArrayFunction(self.transition_jacobian_function)
+        return ArrayFunction(self.transition_function)
 
     @cached_property
     def _output(self) -> ArrayFunction:
+        return ArrayFunction(self.output_function)
+
+    @cached_property
+    def _transition_jacobian(self) -> ArrayFunction:
+        return ArrayFunction(self.transition_jacobian_function)
+
+    @cached_property
+    def _output_jacobian(self) -> ArrayFunction:
         return ArrayFunction(self.output_jacobian_function)
 
     @cached_property
@@ -164,6 +172,9 @@ class Model(ABC):
         checked = []
         sizes = (self.state_size, self.input_size, self.parameter_size)
         for value, size, name in zip(given, sizes, ("state", "input", "parameters"), strict=True):
+            if type(value) is np.ndarray and value.shape == (size,):
+                checked.append(value)
+                continue
             if value is None:
                 if size:
                     raise DataError(f"{name}: the model needs {size} component(s) and got none")
@@ -175,13 +186,13 @@ class Model(ABC):
             checked.append(value)
         return checked
 
-    def _evaluate(self, function: str, which: int, x: Any, u: Any, p: Any) -> Any:
-        arguments = self._arguments(x, u, p)
-        if any(isinstance(a, SYMBOLIC) for a in arguments):
-            if which:
-                return getattr(self, f"{function}_jacobian_function")(*arguments)[1]
-            return getattr(self, f"{function}_function")(*arguments)
-        return getattr(self, f"_{function}")(which, *arguments)
+    def _evaluate(self, function: str, x: Any, u: Any, p: Any) -> Any:
+        """The last output of a function: the value, or the Jacobian beside it."""
+        x, u, p = arguments = self._arguments(x, u, p)
+        if isinstance(x, SYMBOLIC) or isinstance(u, SYMBOLIC) or isinstance(p, SYMBOLIC):
+            found = getattr(self, f"{function}_function")(*arguments)
+            return found[-1] if isinstance(found, tuple) else found
+        return getattr(self, f"_{function}")(x, u, p)
 
     def step(self, x: Any, u: Any = None, p: Any = None) -> Any:
         """Next state without disturbance, f(x, u, p).
@@ -196,19 +207,19 @@ class Model(ABC):
         Raises:
             ShapeError, DataError: an argument has the wrong size or is missing.
         """
-        return self._evaluate("transition", 0, x, u, p)
+        return self._evaluate("transition", x, u, p)
 
     def output(self, x: Any, u: Any = None, p: Any = None) -> Any:
         """Noise-free measurement h(x, u, p) of all sensors, (p,); `u` acted up to this instant. As `step` otherwise."""
-        return self._evaluate("output", 0, x, u, p)
+        return self._evaluate("output", x, u, p)
 
     def transition_jacobian(self, x: Any, u: Any = None, p: Any = None) -> Any:
         """df/dx (n, n). Arguments and errors as for `step`."""
-        return self._evaluate("transition", 1, x, u, p)
+        return self._evaluate("transition_jacobian", x, u, p)
 
     def output_jacobian(self, x: Any, u: Any = None, p: Any = None) -> Any:
         """dh/dx (p, n). Arguments and errors as for `output`."""
-        return self._evaluate("output", 1, x, u, p)
+        return self._evaluate("output_jacobian", x, u, p)
 
     def residual(self, measured: Any, predicted: Any) -> Any:
         """``measured - predicted``, angles wrapped to (-pi, pi]: arrays (..., p) or CasADi columns."""
