@@ -111,7 +111,7 @@ class ArrayFunction:
         )  # CasADi writes column by column
         buffer: Any
         buffer, self._run = function.buffer()
-        self._buffer = buffer  # `_run` does not keep it alive
+        self._alive = buffer, flat  # `_run` knows them by address only
         for k, array in enumerate(self._arguments):
             buffer.set_arg(k, array.data)
         for k, array in enumerate(flat):
