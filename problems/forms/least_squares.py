@@ -37,7 +37,9 @@ class LeastSquares:
         flags = self._flags.get(key)
         if flags is None:
             found = self.activity.flags(numbers)
-            flags = {e.term.name: f for e, f in zip(self.layout.terms, found, strict=True)}
+            # machine code reads them byte by byte
+            rows = [None if on is None else np.ascontiguousarray(on, dtype=bool) for on in found]
+            flags = {e.term.name: on for e, on in zip(self.layout.terms, rows, strict=True)}
             if len(self._flags) >= PATTERNS:
                 self._flags.clear()
             self._flags[key] = flags

@@ -106,9 +106,8 @@ class ArrayFunction:
         shapes = [function.size_out(k) for k in range(function.n_out())]
         flat = [np.zeros(rows * columns) for rows, columns in shapes]
         rows, columns = shapes[-1]
-        self._result = (
-            flat[-1] if function.n_out() == 1 else flat[-1].reshape(columns, rows).T
-        )  # CasADi writes column by column
+        # CasADi writes column by column
+        self._result = flat[-1] if function.n_out() == 1 else flat[-1].reshape(columns, rows).T
         buffer: Any
         buffer, self._run = function.buffer()
         self._alive = buffer, flat  # `_run` knows them by address only
