@@ -97,7 +97,7 @@ class OSQP(Backend):
             time_limit=common.time_limit,
             max_iter=common.iteration_limit,
             verbose=False,
-            **self._unscaled(),
+            **self._fitting(),
         )
         for name, value in values.items():
             setattr(settings, name, value)
@@ -108,16 +108,17 @@ class OSQP(Backend):
         l, u = self._clipped(l, u)
         self._solver = lib.OSQPSolver(lib.CSC(self._upper.matrix), q, lib.CSC(self._A), l, u, m, n, settings)
 
-    def _unscaled(self) -> dict[str, float]:
+    def _fitting(self) -> dict[str, float]:
         """The library's own scaling off where it does harm.
 
         It scales the cost by q, which at a point far from the origin is large: P becomes small beside the
         regularization sigma. Without rows, thousands of steps of a millionth of the way follow. With rows they restrain
-        it, unless weights differ much; and then ours has been there already.
+        it, unless weights differ much; and then ours has been there already, and a direction of little curvature is
+        not yet one along which the cost falls for ever.
         """
         if not self._m:
             return {"scaling": 0, "alpha": 1.0}
-        return {"scaling": 0} if self._scaling is not None else {}
+        return {"scaling": 0, "eps_dual_inf": 1e-12} if self._scaling is not None else {}
 
     def _run(self, q: np.ndarray, l: np.ndarray, u: np.ndarray, warm: Warm | None) -> QPResult:
         solver = self._solver

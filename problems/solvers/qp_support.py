@@ -11,7 +11,7 @@ import importlib
 import types
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import metadata
 from typing import Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -20,7 +20,7 @@ import numpy as np
 
 from problems.errors import BackendError, DataError, HorizonetError, MissingExtraError, SettingError
 from problems.solvers.base import Options, QPResult, Status
-from problems.solvers.qp_scaling import EVEN, MISLEADING, Scaling, Warm, uneven
+from problems.solvers.qp_scaling import EVEN, MISLEADING, Scaling, Warm, scaled_tolerance, uneven
 from problems.solvers.settings import read_settings
 
 S = TypeVar("S")
@@ -272,7 +272,7 @@ class Backend(ABC):
     settings_type: ClassVar[type[Any]]
 
     def __init__(self, P: Any, q: np.ndarray, A: Any, l: np.ndarray, u: np.ndarray, options: Options) -> None:
-        self._options = options
+        self._options = self._asked = options
         self._settings = checked_settings(self.settings_type, options.extra, self.name)
         try:
             self._library: Any = importlib.import_module(self.module)
@@ -378,10 +378,11 @@ class Backend(ABC):
         # a dense P tells more of its weights
         seen = P if isinstance(P, np.ndarray) else self._P
         if not uneven(seen, MISLEADING if self.dense else EVEN, by_diagonal=self.dense):
-            self._scaling = None
+            self._scaling, self._options = None, self._asked
             return
         self._scaling = scaling = Scaling(seen, A if isinstance(A, np.ndarray) else self._A, equal)
         self._P, self._A = self._taken("P", scaling.P), self._taken("A", scaling.A)
+        self._options = replace(self._asked, tolerance=scaled_tolerance(self._asked.tolerance))
 
     def _taken(self, name: str, matrix: Any) -> Any:
         """`matrix` as this backend stores it; whether it comes dense or sparse, no number may be NaN or infinite."""
@@ -400,7 +401,7 @@ class Backend(ABC):
         if np.isnan(l).any() or np.isnan(u).any():
             return QPResult(None, None, Status.FAILED, message="l or u has entries that are NaN")
         row = int(np.argmax(l - u))
-        if l[row] - u[row] > self._options.tolerance * max(1.0, abs(u[row])):
+        if l[row] - u[row] > self._asked.tolerance * max(1.0, abs(u[row])):
             message = f"bounds of row {row} cross: l = {l[row]:g}, u = {u[row]:g}"
             return QPResult(None, None, Status.INFEASIBLE, message=message)
         # Bounds that cross by rounding mean equality.

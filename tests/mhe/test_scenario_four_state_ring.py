@@ -112,7 +112,9 @@ def test_every_local_solve_is_counted_and_timed() -> None:
 def test_distance_to_the_reference_shrinks_with_the_tolerance(method: str, nodes: int) -> None:
     found = []
     for tolerance in (1e-2, 1e-9):
-        row, made = measure(Job(scenario.name, method, "osqp", complete(scenario, {"tolerance": tolerance}), 7, 0))
+        row, made = measure(
+            Job(scenario.name, method, "osqp", complete(scenario, {"tolerance": tolerance, "bounds": "tight"}), 7, 0)
+        )
         assert made is not None and made.estimate is not None and made.estimate.shape == (21, nodes, 4)
         found.append(row.metrics["distance_to_reference"])
     assert found[0] > 1e-5 and found[1] < 1e-8
