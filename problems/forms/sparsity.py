@@ -70,18 +70,49 @@ class HessianPattern:
         return int(height.max(initial=0))
 
     @cached_property
-    def work(self) -> float:
-        """Operations of a factorization in an approximate minimum degree order of the variable instances."""
+    def common_dim(self) -> int | None:
+        """Dimension of the variable instances where all have the same."""
+        return _common(self._graph[2])
+
+    @property
+    def dims(self) -> list[int]:
+        """Dimensions of variable instances that occur."""
+        return np.unique(self._graph[2]).tolist()
+
+    @property
+    def block_places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Instances of row and column of every block (row <= column), where it begins, entries above its diagonal.
+
+        Entry (a, b) of a block stands at ``begin + b above + b (b + 1) / 2 + a``.
+        """
+        row, col, _ = self._graph
+        return row, col, self._corners, self._off[col]
+
+    @cached_property
+    def elimination(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The factor of the graph of instances in an approximate minimum degree order, 32-bit integers.
+
+        Returns:
+            Starts of its columns; their rows, below the diagonal and ascending; the order (instances as they come).
+        """
         import qdldl
         import scipy.sparse as sp
 
-        row, col, dims = self._graph
+        row, col, _ = self._graph
         degree = np.bincount(np.concatenate([row, col]), minlength=self.blocks) + 1.0
-        values = np.where(row == col, degree[col], -1.0)
-        graph = sp.csc_matrix((values, (row, col)), shape=(self.blocks, self.blocks))
+        graph = sp.csc_matrix((self.blocks, self.blocks))
+        # as it stands sorted by columns
+        graph.indptr, graph.indices = np.concatenate([[0], self._last + 1]), row
+        graph.data = np.where(row == col, degree[col], -1.0)
         L, _, order = qdldl.Solver(graph, upper=True).factors()
-        size = dims[order].astype(float)
-        rows = size + np.bincount(np.repeat(np.arange(self.blocks), np.diff(L.indptr)), size[L.indices], self.blocks)
+        return L.indptr, L.indices, order.astype(np.int32)
+
+    @cached_property
+    def work(self) -> float:
+        """Operations of a factorization in the order of `elimination`."""
+        indptr, indices, order = self.elimination
+        size = self._graph[2][order].astype(float)
+        rows = size + np.bincount(np.repeat(np.arange(self.blocks), np.diff(indptr)), size[indices], self.blocks)
         return float((size * rows**2).sum())
 
     def independent_blocks(self) -> list[np.ndarray]:

@@ -1,8 +1,9 @@
 """Factorizations of positive definite matrices given by the upper triangle of a fixed pattern.
 
-Every class finds its order of elimination once and keeps it from one `factor` to the next. Which is fastest is a matter
-of the work that elimination takes (`HessianPattern.work`): scalar LDL' wins on trees and plane graphs, block methods
-where the factor fills in, as in pose graphs in space.
+Every class finds its order of elimination once and keeps it from one `factor` to the next. Where all variable instances
+have the same dimension, our Cholesky by blocks of it wins from some hundred unknowns until the factor fills in heavily
+(`HessianPattern.work`), where Pardiso does. Of mixed dimensions scalar LDL' wins on trees and plane graphs, SuperLU
+where the factor fills in.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ from problems.forms.sparsity import HessianPattern
 
 DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
 BAND_WIDTH = 32  # entries above the diagonal up to which banded Cholesky is faster, if it is much less than all
-BLOCK_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
+BLOCK_DIM = 6  # largest dimension of instances for Cholesky by blocks, whose code grows with its square
+BLOCK_SIZE = 1000  # unknowns from which that repays its compilation (20 ms once) within some ten factorizations
+BLOCK_WORK = 5e8  # work from which Pardiso is faster than it (measured on grids: equal at 3e8, half the time at 1e9)
+FILLED_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
+HEAVY_WORK = 2e7  # work from which Pardiso is, whose import takes a second once
 MESH_PAIRS = 1.75  # pairs of instances with a common term, per instance, from which a graph is much more than a tree
 MESH_SIZE = 20_000  # unknowns from which such graphs fill in heavily, and below which others never do
-HEAVY_WORK = 2e7  # the same for Pardiso, whose import takes a second once
 
-LinearSolver = Literal["auto", "dense", "banded", "qdldl", "superlu", "pardiso", "cholmod", "schur"]
+LinearSolver = Literal["auto", "dense", "banded", "qdldl", "superlu", "pardiso", "cholmod", "schur", "block"]
 
 
 class SingularError(ArithmeticError):
@@ -262,26 +266,33 @@ def factorization(pattern: HessianPattern, solver: LinearSolver = "auto") -> Fac
 
     Raises:
         MissingExtraError: its package is not installed.
+        SettingError: it does not take this pattern.
     """
     if solver == "auto":
-        # the work takes an order of elimination to know; of these it is known without
+        # the work takes an order of elimination to know; where no block method is sure to need it, it is known without
         mesh = pattern.pairs > MESH_PAIRS * pattern.blocks
         if pattern.bandwidth <= min(BAND_WIDTH, pattern.size // 4):
             solver = "banded"
         elif pattern.size <= DENSE_SIZE:
             solver = "dense"
+        elif pattern.size >= BLOCK_SIZE and 1 < (pattern.common_dim or 0) <= BLOCK_DIM:
+            solver = "pardiso" if find_spec("pypardiso") and pattern.work >= BLOCK_WORK else "block"
         elif not mesh and pattern.size < MESH_SIZE:
             solver = "qdldl"
         elif find_spec("pypardiso") and (mesh and pattern.size >= MESH_SIZE or pattern.work >= HEAVY_WORK):
             solver = "pardiso"
         else:
-            solver = "superlu" if pattern.work >= BLOCK_WORK else "qdldl"
+            solver = "superlu" if pattern.work >= FILLED_WORK else "qdldl"
     elif solver == "pardiso" and find_spec("pypardiso") is None:
         raise MissingExtraError("linear solver pardiso", "pypardiso", "pardiso")
     elif solver == "schur":
         from problems.solvers.schur import SchurComplement
 
         return SchurComplement(pattern)
+    if solver == "block":
+        from problems.solvers.block_cholesky import BlockCholesky
+
+        return BlockCholesky(pattern)
     return CLASSES[solver](pattern)
 
 

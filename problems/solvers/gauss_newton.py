@@ -58,8 +58,9 @@ class Settings:
         screen: answer steps that satisfy the linearized constraints by the linear solve; else the QP backend is always
             called.
         linear_solver: factorization of the normal equations: ``dense``, ``banded`` (chains in order), ``qdldl``,
-            ``superlu``, ``pardiso`` (extra ``pardiso``), ``cholmod`` (extra ``gpl``), ``schur`` (few poses, many
-            landmarks), or ``auto``: by size, band, work and what is installed.
+            ``block`` (variables of one dimension up to 6), ``superlu``, ``pardiso`` (extra ``pardiso``), ``cholmod``
+            (extra ``gpl``), ``schur`` (few poses, many landmarks), or ``auto``: by size, band, work and what is
+            installed.
         graduated: graduated non-convexity: come to the robust losses from wider ones, past local minima of outliers.
     """
 

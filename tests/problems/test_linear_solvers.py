@@ -13,7 +13,7 @@ from problems import SE2, SE3, Gaussian, Problem, Vector
 from problems.errors import MissingExtraError, SettingError
 from problems.solvers import factorizations
 
-SOLVERS = ["dense", "banded", "qdldl", "superlu", "pardiso", "cholmod"]
+SOLVERS = ["dense", "banded", "qdldl", "superlu", "pardiso", "cholmod", "block"]
 PACKAGES = {"pardiso": "pypardiso", "cholmod": "cvxopt"}
 
 
@@ -97,14 +97,40 @@ def test_auto_goes_by_size_and_work(monkeypatch: pytest.MonkeyPatch) -> None:
     dense = chain(Vector(6), 60, all_pairs=True)
     assert factorizations.DENSE_SIZE < 360
     monkeypatch.setattr(factorizations, "HEAVY_WORK", work(dense))
-    monkeypatch.setattr(factorizations, "BLOCK_WORK", work(dense))
+    monkeypatch.setattr(factorizations, "FILLED_WORK", work(dense))
     monkeypatch.setattr(factorizations, "find_spec", lambda name: None)
     assert chosen(dense) == "superlu"
-    monkeypatch.setattr(factorizations, "BLOCK_WORK", 2 * work(dense))
+    monkeypatch.setattr(factorizations, "FILLED_WORK", 2 * work(dense))
     assert chosen(dense) == "qdldl"
     if find_spec("pypardiso") is not None:
         monkeypatch.setattr(factorizations, "find_spec", find_spec)
         assert chosen(dense) == "pardiso"
+
+
+def test_auto_takes_blocks_where_they_repay_their_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
+    def chosen(problem: Problem) -> str:
+        session: Any = problem.compile("gauss-newton")
+        return session._linear.name
+
+    joined = chain(SE2, 60, all_pairs=True)
+    monkeypatch.setattr(factorizations, "BLOCK_SIZE", 181)
+    assert chosen(joined) == "qdldl"
+    monkeypatch.setattr(factorizations, "BLOCK_SIZE", 180)
+    assert chosen(joined) == "block"
+    monkeypatch.setattr(factorizations, "BLOCK_WORK", work(joined))
+    monkeypatch.setattr(factorizations, "find_spec", lambda name: None)
+    assert chosen(joined) == "block"
+    monkeypatch.setattr(factorizations, "find_spec", find_spec)
+    if find_spec("pypardiso") is not None:
+        assert chosen(joined) == "pardiso"
+    # scalars, blocks that are too large, and dimensions that differ
+    assert chosen(chain(Vector(1), 180, all_pairs=True)) != "block"
+    assert chosen(chain(Vector(7), 30, all_pairs=True)) != "block"
+    landmark = joined.variables("landmark", Vector(2))
+    joined.cost("seen", lambda a, b: a.translation - b, (joined.unknowns["x"][0], landmark))
+    assert chosen(joined) != "block"
+    with pytest.raises(SettingError, match="one dimension, at most 6; these have 2, 3"):
+        joined.compile("gauss-newton", linear_solver="block")
 
 
 def test_unknown_and_missing_linear_solvers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
