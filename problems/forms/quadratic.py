@@ -310,6 +310,11 @@ class QuadraticProgram:
         at = [np.arange(starts[n], starts[n] + inputs[n].rows * inputs[n].size) for n in matrix]
         self._matrix = np.concatenate([np.zeros(0, np.intp), *at])
 
+    @property
+    def remaining(self) -> int:
+        """How many unknowns elimination leaves."""
+        return self.layout.size - self._columns.size
+
     def _dense_numbers(self) -> int:
         """Numbers in the largest matrices that the dense form holds.
 
@@ -320,7 +325,7 @@ class QuadraticProgram:
         for term in self.problem.terms.values():
             rows[term.kind] += term.count * template_of(term).dim
         size, solved = self.layout.size, self._columns.size
-        square = size**2 if rows["equality"] > solved else solved**2 + (size - solved) ** 2
+        square = size**2 if rows["equality"] > solved else solved**2 + self.remaining**2
         return (size + rows["inequality"]) * self.layout.data_size + square
 
     def condense(self, eliminate: Sequence[Any]) -> QuadraticProgram:

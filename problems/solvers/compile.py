@@ -24,6 +24,7 @@ from problems.solvers.qp_session import QPSession
 from problems.solvers.qp_support import Backend, checked_settings
 from problems.solvers.session import Session
 
+FEW = 50  # unknowns that elimination leaves, up to which dual active sets answer sooner however many rows there are
 ALIASES = {"gtsam": "gtsam-lm"}
 FORMS = ("quadratic", "nonlinear", "graph")
 ASSEMBLIES = {"maps": QPSession, "code": CodeSession}
@@ -98,7 +99,8 @@ def _quadratic(
         raise UnknownNameError("assembly", str(assembly), ASSEMBLIES)
     warm = bool(settings.pop("warm", True))
     if backend is None:
-        backend = registry.load("solvers", "daqp" if program.dense or assembly == "code" else "proxqp")
+        few = program.dense or program.remaining <= FEW or assembly == "code"
+        backend = registry.load("solvers", "daqp" if few else "proxqp")
     options = options_of(settings)
     if issubclass(backend, Backend):  # a screened session may need its backend late or never
         checked_settings(backend.settings_type, options.extra, backend.name)

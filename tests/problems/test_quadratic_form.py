@@ -239,7 +239,7 @@ def test_what_elimination_leaves_decides_whether_matrices_are_dense() -> None:
     p.cost("c", same, on=w)
     p.equality("e", lambda x, w, z: x - w - z, on=(x, w), data=z)
     assert not QuadraticProgram(p).dense
-    assert QuadraticProgram(p, [x]).dense
+    assert QuadraticProgram(p, [x]).dense and QuadraticProgram(p, [x]).remaining == count
     assert not QuadraticProgram(p, [x], dense=False).dense
     bounds = p.data("bounds", 1, count)
     p.inequality("b", same, on=x, upper=bounds)
