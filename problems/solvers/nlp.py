@@ -11,6 +11,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import metadata
 from typing import Any, ClassVar, Literal
 
@@ -25,6 +26,7 @@ from problems.problem import Problem
 from problems.solvers.base import Options, Status
 from problems.solvers.gauss_newton import GaussNewton
 from problems.solvers.least_squares_solution import LeastSquaresCheck
+from problems.solvers.nlp_stages import StagedProgram
 from problems.solvers.optimality import optimality
 from problems.solvers.qp_step import qp_backend
 from problems.solvers.qp_support import checked_settings, native
@@ -119,10 +121,11 @@ class NLPSession(Session):
     def _call(self, arguments: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Results and statistics of the plugin."""
 
-    def _nlpsol(self, options: Mapping[str, Any], derivatives: bool) -> ca.Function:
+    def _nlpsol(self, options: Mapping[str, Any], derivatives: bool, stated: Any = None) -> ca.Function:
+        """`stated` in place of the program."""
         common = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
         given = self.program.derivatives if derivatives else {}
-        return ca.nlpsol("solver", self.plugin, self.program.casadi, {**common, **given, **options})
+        return ca.nlpsol("solver", self.plugin, stated or self.program.casadi, {**common, **given, **options})
 
     def _solve(self) -> Solution:
         bound = self.least_squares.bind(self.store)
@@ -217,8 +220,9 @@ class IPOPT(NLPSession):
 class FATROP(NLPSession):
     """Session of the solver ``fatrop`` (Vanroye et al. 2023).
 
-    No stage structure is handed over, so its matrices are dense: for problems of up to some hundred unknowns. It has no
-    time limit; the iteration limit is what bounds a solve.
+    Where equalities define unknowns one stage after the other, as the transitions of a window in form F1 do, their
+    stages are handed over. Else its matrices are dense: for problems of up to some hundred unknowns. It has no time
+    limit; the iteration limit is what bounds a solve.
     """
 
     plugin = "fatrop"
@@ -235,12 +239,25 @@ class FATROP(NLPSession):
         settings = checked_settings(FATROPSettings, self.options.extra, "fatrop")
         common = self.options
         fatrop = native(settings, tol=0.1 * common.tolerance, max_iter=common.iteration_limit, print_level=0)
-        self._solver = self._nlpsol({"fatrop": fatrop}, False)
+        staged, options = self._staged, {"fatrop": fatrop}
+        if staged is None:
+            self._solver = self._nlpsol(options, False)
+        else:
+            self._solver = self._nlpsol({**options, **staged.options}, False, staged.casadi)
+
+    @cached_property
+    def _staged(self) -> StagedProgram | None:
+        return StagedProgram.of(self.program)
 
     def _call(self, arguments: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        staged = self._staged
         arguments["lbg"], arguments["ubg"] = _tightened(arguments["lbg"], arguments["ubg"])
+        if staged is not None:
+            arguments = staged.ordered(arguments)
         with contextlib.redirect_stdout(io.StringIO()):
             results = self._solver(**arguments)
+        if staged is not None:
+            results = staged.restored(results)
         stats = self._solver.stats()
         return results, {"return_status": stats["fatrop"]["return_flag"], "iter_count": stats["iter_count"]}
 
