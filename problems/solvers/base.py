@@ -18,7 +18,8 @@ class Status(StrEnum):
 
     ``solved`` bounds errors of the cost, not distances. Quadratic programs: violation, dual residual and gap are within
     tolerance of their sizes (`Options.tolerance`), and with them the cost, relative to the numbers it is the difference
-    of. Graphs and nonlinear programs: the Newton decrement is at most 0.1 tolerance max(1, cost). Near an optimum a
+    of; where weights differ by more than 1e5, what relative residuals hide counts too (`problems.solvers.qp_scaling`).
+    Graphs and nonlinear programs: the Newton decrement is at most 0.1 tolerance max(1, cost). Near an optimum a
     cost is flat, so in units of standard deviations unknowns may be off by the root of it: at 1e-8 by some 1e-4.
     Active-set methods and full Newton steps end far nearer; interior-point backends are asked for a hundredth of the
     tolerance, after which distances are mostly below ten tolerances.
