@@ -1,7 +1,7 @@
 """Factorizations of positive definite matrices given by the upper triangle of a fixed pattern.
 
 Every class finds its order of elimination once and keeps it from one `factor` to the next. Where all variable instances
-have the same dimension, our Cholesky by blocks of it wins from some hundred unknowns until the factor fills in heavily
+have the same dimension, our Cholesky by blocks of it wins from some thousand unknowns until the factor fills in heavily
 (`HessianPattern.work`), where Pardiso does. Of mixed dimensions scalar LDL' wins on trees and plane graphs, SuperLU
 where the factor fills in.
 """
@@ -25,7 +25,7 @@ from problems.forms.sparsity import HessianPattern
 DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
 BAND_WIDTH = 32  # entries above the diagonal up to which banded Cholesky is faster, if it is much less than all
 BLOCK_DIM = 6  # largest dimension of instances for Cholesky by blocks, whose code grows with its square
-BLOCK_SIZE = 1000  # unknowns from which that repays its compilation (20 ms once) within some ten factorizations
+BLOCK_SIZE = 2000  # unknowns from which it repays its compilation, 20 ms once, in 8 to 20 solves (6000: in one to six)
 BLOCK_WORK = 5e8  # work from which Pardiso is faster than it (measured on grids: equal at 3e8, half the time at 1e9)
 FILLED_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
 HEAVY_WORK = 2e7  # work from which Pardiso is, whose import takes a second once
