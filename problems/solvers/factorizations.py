@@ -25,7 +25,7 @@ from problems.forms.sparsity import HessianPattern
 DENSE_SIZE = 120  # unknowns up to which dense Cholesky is faster (measured)
 BAND_WIDTH = 32  # entries above the diagonal up to which banded Cholesky is faster, if it is much less than all
 BLOCK_DIM = 6  # largest dimension of instances for Cholesky by blocks, whose code grows with its square
-BLOCK_SIZE = 2000  # unknowns from which it repays its compilation, 20 ms once, in 8 to 20 solves (6000: in one to six)
+BLOCK_SIZE = 2000  # unknowns from which it repays its compilation, 20 ms once, in 8 to 20 solves (at 3000: in 4 to 7)
 BLOCK_WORK = 5e8  # work from which Pardiso is faster than it (measured on grids: equal at 3e8, half the time at 1e9)
 FILLED_WORK = 2e8  # work from which SuperLU is faster than QDLDL (measured on graphs in the plane and in space)
 HEAVY_WORK = 2e7  # work from which Pardiso is, whose import takes a second once
