@@ -311,7 +311,7 @@ def settled_step(estimator: Any, measurements: np.ndarray, repetitions: int = 3)
         seconds = []
         for y in measurements:
             start = time.perf_counter()
-            estimator.step(y)
+            estimator.step(y).state  # noqa: B018
             seconds.append(time.perf_counter() - start)
         rounds.append(seconds[-100:])
     return float(np.median(np.min(rounds, axis=0)))

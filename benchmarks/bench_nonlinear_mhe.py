@@ -31,7 +31,7 @@ CLOSE = 1e-5  # m and rad
 TOLERANCE = 1e-8
 ANCHORS = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]])
 # their median time over ours, at least
-WANTED = {"do-mpc": 35.0, "Opti ipopt": 20.0, "Opti fatrop": 12.0, "expanded ipopt": 7.0, "expanded fatrop": 1.8}
+WANTED = {"do-mpc": 70.0, "Opti ipopt": 45.0, "Opti fatrop": 30.0, "expanded ipopt": 15.0, "expanded fatrop": 3.8}
 GOALS = {"do-mpc": 100.0, "Opti ipopt": 25.0, "Opti fatrop": 12.0}
 DT = 0.1
 
