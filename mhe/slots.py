@@ -138,7 +138,10 @@ class Slots:
 
 def finite(value: Any, size: int, what: str) -> np.ndarray:
     """`value` as (size,) finite numbers. Raises ShapeError, DataError."""
-    array = np.atleast_1d(np.asarray(value, dtype=float))
+    array = np.asarray(value, dtype=float)
+    if array.shape == (size,) and array.dot(array) < np.inf:
+        return array
+    array = np.atleast_1d(array)
     if array.shape != (size,):
         raise ShapeError(f"{what}: expected shape ({size},), got {array.shape}")
     if not np.isfinite(array).all():

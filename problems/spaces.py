@@ -263,7 +263,9 @@ def points(space: Space, values: Any, count: int, what: str) -> np.ndarray:
             f"{what}: expected shape ({count}, {space.ambient}) for {count} instance(s) on {space.name}, "
             f"got {np.shape(values)}"
         )
-    if not np.isfinite(array).all():
+    flat = array.ravel()
+    # one product tells that all are finite, unless they are huge
+    if not flat.dot(flat) < np.inf and not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise DataError(f"{what}: instance {row} is not finite ({array[row]})")
     return space.normalize_array(np.array(array))

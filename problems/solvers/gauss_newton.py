@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from problems.errors import DataError, SettingError, UnobservableError
-from problems.forms.costs import Bound
+from problems.forms.costs import Bound, Flags
 from problems.forms.graduated import ladder
 from problems.forms.layout import Layout
 from problems.forms.least_squares import Constraints, LeastSquares
@@ -93,7 +93,7 @@ class GaussNewton(Session):
         self.sparse = pattern.size > DENSE_SIZE and self._linear.name != "banded"
         self._chain = self._chain_steps()
         rungs = ladder(problem) if self.settings.graduated else []
-        self._known_gauge: tuple[bytes, str] | None = None
+        self._known_gauge: tuple[Flags, str] | None = None
         self._rungs = [LeastSquares(rung, Layout(rung)) for rung in rungs]
         self._renew()
 
@@ -201,18 +201,20 @@ class GaussNewton(Session):
 
     def _gauge(self, search: _Search) -> str:
         """What to say of a direction that the costs do not see; looked for when the active instances change."""
-        if self.constraints.size or search.hessian is None:
+        if self.constraints.size or (search.hessian is None and not search.chained):
             return ""
-        key = b"|".join(b"" if on is None else on.tobytes() for on in search.bound.flags.values())
-        if self._known_gauge is None or self._known_gauge[0] != key:
+        flags = search.bound.flags  # one object for each pattern
+        if self._known_gauge is None or self._known_gauge[0] is not flags:
             hessian, damped = search.hessian, search.factored != 0
-            if search.chained:  # which has a factor of its own
+            if search.chained and self._chain is not None:  # which has a factor of its own
+                hessian = self._chain.hessian
                 self._linear.factor(hessian)
+            assert hessian is not None
             if not self.settings.screen:  # nothing was factorized yet
                 shifted, damped = hessian.copy(), True
                 shifted[self.form_.pattern.diagonal] *= 1 + 1e-10
                 self._linear.factor(shifted)
-            self._known_gauge = key, gauge_freedom(self.form_.pattern, hessian, self._linear, self.layout, damped)
+            self._known_gauge = flags, gauge_freedom(self.form_.pattern, hessian, self._linear, self.layout, damped)
         return self._known_gauge[1]
 
 
@@ -264,8 +266,6 @@ class _Search:
         deadline = time.perf_counter() + self.options.time_limit
         self.chained, steps = chain.run(self.bound, self.point, 0.1 * self.options.tolerance, limit, deadline)
         self.point, self.iterations = chain.point, self.iterations + steps
-        if self.chained:
-            self.hessian = chain.hessian
         return self.chained
 
     def feedback(self, hessian: np.ndarray) -> tuple[Status, str]:
