@@ -294,7 +294,7 @@ class MovingHorizonEstimator:
             return None
         self._followed = solution
         slots.times.append(instant)
-        reported = solution.reported.copy()
+        reported = solution.reported
         seconds = solution.spent = perf_counter() - started
         fields = self._common | {"state": reported, "seconds": seconds, "time": instant, "solution": solution}
         if self.window.parameters is not None:

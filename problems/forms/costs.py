@@ -111,7 +111,7 @@ class CostCode:
 
     def __init__(self, layout: Layout, costs: Sequence[Cost], pattern: HessianPattern) -> None:
         self._costs, self.size, self.nonzeros = costs, pattern.size, pattern.nonzeros
-        self._dynamic = [cost for cost in costs if cost.dynamic]
+        self._dynamic: list[tuple[Cost, slice]] = []  # whose whitening is made of data, and where it stands
         self._index: list[np.ndarray] = []
         constants = self._place(layout)
         self._values = np.concatenate([np.zeros(self.free), *constants])
@@ -128,25 +128,28 @@ class CostCode:
             np.int64,
         ).reshape(len(costs), len(SUM_TASK))
         self._entered: Bound | None = None
+        self._flags: Flags | None = None
 
     def bind(self, store: DataStore, numbers: np.ndarray, flags: Flags) -> Bound:
         """The costs for the data `numbers` (missing ones read as zero) and the weights in `store`."""
         parameters = np.empty(self.free)
         parameters[: numbers.size] = numbers
-        at = numbers.size
-        for cost in self._dynamic:
+        for cost, part in self._dynamic:
             white = cost.whitening(store)
-            size = white.shape[0] * cost.count
-            parameters[at : at + size].reshape(cost.count, white.shape[0])[:] = white.T
-            at += size
+            if white.shape[1] == cost.count:
+                parameters[part] = white.T.ravel()
+            else:
+                parameters[part].reshape(cost.count, -1)[:] = white.T
         return Bound(self, parameters[: numbers.size], flags, parameters)
 
     def enter(self, bound: Bound) -> None:
         """Let programs read what is bound."""
         if self._entered is not bound:
             self._values[: self.free] = bound.parameters
-            on = [bound.flags[cost.term.name] for cost in self._costs]
-            self._tasks[:, SUM_TASK.index("flags")] = [0 if one is None else address(one) for one in on]
+            if bound.flags is not self._flags:  # one object for each pattern
+                on = [bound.flags[cost.term.name] for cost in self._costs]
+                self._tasks[:, SUM_TASK.index("flags")] = [0 if one is None else address(one) for one in on]
+                self._flags = bound.flags
             self._entered = bound
 
     def sums_of(self, bound: Bound, point: np.ndarray, run: Program, size: int) -> np.ndarray:
@@ -178,9 +181,10 @@ class CostCode:
         """Where every cost reads its inputs; what follows the first `free` numbers."""
         size = layout.data_size
         whitenings: dict[int, np.ndarray] = {}
-        for cost in self._dynamic:
+        for cost in (one for one in self._costs if one.dynamic):
             rows = cost.count * cost.whitening_size
             whitenings[id(cost)] = size + np.arange(rows).reshape(cost.count, cost.whitening_size)
+            self._dynamic.append((cost, slice(size, size + rows)))
             size += rows
         self.free = size
         constants: list[np.ndarray] = []
