@@ -175,7 +175,7 @@ class _Blocks:
         from scipy.sparse import coo_matrix, csc_matrix
 
         size = pattern.size
-        column = np.repeat(np.arange(size), np.diff(pattern.indptr))
+        column = pattern.columns
         one = np.concatenate([np.repeat(block, block.shape[1], axis=1).ravel() for block in instances])
         other = np.concatenate([np.tile(block, block.shape[1]).ravel() for block in instances])
         kept = one > other

@@ -144,7 +144,7 @@ class NonlinearMarginal:
         pattern, size = self._form.pattern, part.layout.size
         place = np.empty(size, np.intp)  # dropped unknowns first, then the kept ones in their order
         place[self.plan.columns] = np.arange(size)
-        rows, columns = place[pattern.indices], place[np.repeat(np.arange(size), np.diff(pattern.indptr))]
+        rows, columns = place[pattern.indices], place[pattern.columns]
         self._upper, self._lower = rows * size + columns, columns * size + rows
 
     def __call__(self, store: DataStore, point: np.ndarray) -> Marginal:

@@ -50,7 +50,7 @@ class QPStep:
         keep = ~np.isin(cols, pins.columns)
         self._keep = None if keep.all() else keep
         self._shape, self._rows, self._cols = shape, rows, cols
-        upper = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+        upper = pattern.columns
         self._upper = (pattern.indices, upper)
         # some backends take 32-bit indices only
         self._half = (pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32))
